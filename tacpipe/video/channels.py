@@ -148,6 +148,13 @@ class IntraDecoder:
         return image
 
 
+class FrameBatch(Protocol):
+    """A batch of frames: a table or record batch of pyarrow, or arrays by name."""
+
+    def column(self, place: Any, /) -> Any:
+        """Return a column by its name."""
+
+
 class LiveChannels:
     """The channels of a live camera: takes batches of frames, and returns tables of channels."""
 
@@ -155,18 +162,19 @@ class LiveChannels:
         self._channels, self.schema = channels, channels_schema(schema, channels)
         self._decoder = IntraDecoder(video_format, grey=channels.grey)
 
-    def push(self, frames: pa.Table) -> pa.Table:
+    def push(self, frames: FrameBatch) -> pa.Table:
         """Return the rows of the frames that can be decoded, with their clocks."""
         import pyarrow as pa
 
         rows: list[int] = []
         values: list[AnyFloats] = []
-        for row, packet in enumerate(frames.column(PACKET).to_pylist()):
+        packets = frames.column(PACKET)
+        for row, packet in enumerate(packets.tolist() if isinstance(packets, np.ndarray) else packets.to_pylist()):
             image = self._decoder.decode(packet) if packet else None
             if image is not None:
                 rows.append(row)
                 values.append(self._channels.values(image))
-        clocks = [frames.column(name).take(rows) for name in self.schema.names if name in CLOCKS]
+        clocks = [pa.array(np.asarray(frames.column(name))[rows]) for name in self.schema.names if name in CLOCKS]
         matrix: Float32s = np.array(values, np.float32).reshape(len(rows), len(self.schema) - len(clocks))
         return pa.table([*clocks, *map(pa.array, np.ascontiguousarray(matrix.T))], schema=self.schema)
 

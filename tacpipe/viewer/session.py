@@ -359,7 +359,7 @@ def _space_views(contents: DrawnContents) -> tuple[Any, float]:
     ]
     views += [rrb.Horizontal(*cameras, name="Cameras")] if len(cameras) > 1 else cameras
     views.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
-    return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 2.4
+    return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 4.0 if contents.markers else 2.4
 
 
 def _map_view(name: str, finger: Taxels, contents: DrawnContents) -> Any:

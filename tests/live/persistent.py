@@ -74,6 +74,9 @@ class Persistence:
             since_ns = int(t_ns[0]) - self.beginning.origin_ns
             self._next_ns = self.beginning.origin_ns + -(-since_ns // PERIOD_NS) * PERIOD_NS
 
+    def continue_cameras(self, previous: Any) -> None:
+        """It has no cameras."""
+
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return a forecast for each grid point, on request for the newest alone."""
         forecasts = []

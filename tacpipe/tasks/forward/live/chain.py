@@ -18,6 +18,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
+from tacpipe.live.extraction import live_channels
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
     from tacpipe.live.decoding import BatchColumns
     from tacpipe.store.records import Step
+    from tacpipe.video.channels import LiveChannels
 
 CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
 
@@ -121,9 +123,12 @@ class LiveChain:
         beginning: Beginning | None = None,
         targets: Targets | None = None,
         quantiles: Sequence[int] = (),
+        cameras: Mapping[str, LiveChannels | None] | None = None,
     ) -> None:
         """Make a chain of parts that fit; `for_model` checks that they do."""
         self._targets = targets
+        # Channels of streams of frames, by stream. None without the first frame of the session, to which they refer.
+        self._cameras = dict(cameras or {})
         self._quantiles = (
             forecaster.quantiles_of(quantiles)[1] if quantiles else []
         )  # places of the quantiles in a band
@@ -194,8 +199,11 @@ class LiveChain:
         if plan_from and plan_from not in layouts:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
+        cameras = live_channels(steps, layouts)
+        layouts = {**layouts, **{name: camera.schema for name, camera in cameras.items()}}
         layout = InputLayout.for_forecaster(forecaster, stages.synchronize, layouts, master)
-        return cls(forecaster, steps, layout, beginning, targets, quantiles)
+        known = cameras if beginning is None else dict.fromkeys(cameras)
+        return cls(forecaster, steps, layout, beginning, targets, quantiles, known)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -282,7 +290,16 @@ class LiveChain:
         if stream == PLAN:
             self._push_plans(batch)
         elif stream in self._layout.readings and batch.num_rows:
+            if stream in self._cameras:
+                camera = self._cameras[stream]
+                if camera is None:
+                    return
+                batch = camera.push(batch)
             self._grid.push(stream, *self._layout.samples(stream, batch))
+
+    def continue_cameras(self, previous: LiveChain) -> None:
+        """Continue the channels of the cameras of an earlier chain of the session, which know the untouched gels."""
+        self._cameras = dict(previous._cameras)
 
     def plan(self, arrived_ns: int, t_ns: Times, poses: AnyFloats) -> None:
         """Take planned motion that arrived at ``arrived_ns``; it replaces the plan before it.

@@ -79,6 +79,9 @@ class CausalChain(Protocol):
     def push(self, stream: str, batch: Any) -> None:
         """Take samples."""
 
+    def continue_cameras(self, previous: Any) -> None:
+        """Continue the channels of the cameras of an earlier chain."""
+
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return the forecasts up to a time, on request of the newest grid point alone."""
 
@@ -155,7 +158,9 @@ class ForecastEngine(Engine):
         """Continue with a chain that lacks the blocks that were thrown away."""
         if self.running:
             self.overflows += 1
-            self._restart("blocks were thrown away under overload", self.chain.beginning)
+            previous = self.chain
+            self._restart("blocks were thrown away under overload", previous.beginning)
+            self.chain.continue_cameras(previous)
 
     def begin_stream(self, stream: str) -> None:
         """Decode a stream from the start of the recording on."""

@@ -20,6 +20,7 @@ import pyarrow as pa
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live.extraction import extracted_streams
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
@@ -110,7 +111,7 @@ def check(digest: str, recordings: Dataset) -> None:
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
-    tables = streams_as_recorded(recording)
+    tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
     session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
     chain = replay.build_chain(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)

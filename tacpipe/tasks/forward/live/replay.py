@@ -10,6 +10,7 @@ import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
+from tacpipe.live.extraction import extracted_streams
 from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
@@ -75,7 +76,7 @@ def _predict_recording(
     allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
     """Return the predictions of a recording, and how many grid points each cause had."""
-    tables = streams_as_recorded(recording)
+    tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.channels.streams import GRID, max_step
 from tacpipe.errors import TacpipeError
+from tacpipe.live.extraction import CHANNELS
 from tacpipe.live.stages import stage_params
 
 if TYPE_CHECKING:
@@ -36,10 +37,10 @@ def causal_stages(steps: Sequence[Step]) -> CausalStages:
     params_by_stage = {}
     for step in steps:
         name = step["stage"]
-        if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
+        if name not in (SYNCHRONIZE, CONTACTS, *CHANNELS) and not name.startswith(COMPRESS):
             raise TacpipeError(
                 f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which cannot run live. Train "
-                f"one behind synchronize, segment contacts and, optionally, compress."
+                f"one behind synchronize, segment contacts and, optionally, extract markers or difference, and compress."
             )
         params_by_stage[name] = stage_params(step)
     missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in params_by_stage]
