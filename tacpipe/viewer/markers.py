@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Floats, Times
-from tacpipe.traces.curves import TIME, described
+from tacpipe.traces.curves import TIME, field_metadata
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -66,7 +66,7 @@ def _places(table: pa.Table) -> Mapping[tuple[int, int, int], str]:
     """Return the columns of displacements by row and column of the marker, from 1, and axis, from 0."""
     places: dict[tuple[int, int, int], str] = {}
     for field in table.schema:
-        about = described(field)
+        about = field_metadata(field)
         if about.get("quantity") == "tactile" and about.get("unit") in UNITS and about.get("axis") in AXES:
             if not {"row", "column"} <= set(about):
                 return {}
