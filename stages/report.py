@@ -30,7 +30,7 @@ class Params:
     traces: NonNegativeInt = 2  # number of recordings whose predictions are drawn, for each forecast shown in full
 
 
-@stage(version=11)
+@stage(version=12)
 def report(params: Params, results: Datasets) -> Result:
     """Return a page with the answer, charts, tables, and the source of every number."""
     from tacpipe.plugins.stage import Result

@@ -224,6 +224,16 @@ Kind = Literal["model", "variant", "baseline", "oracle", "control"]
 CONFIG = "config.json"
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """The prediction of a model for a recording."""
+
+    recording: str
+    expected: str  # the recording's label
+    predicted: str
+    is_right: bool
+
+
 class TaskReport:
     """How results of one task are read, compared and reported.
 
@@ -255,6 +265,10 @@ class TaskReport:
     def uses(self, dataset: Dataset) -> bool:
         """Return whether the page can use a dataset that is not a result."""
         return False
+
+    def outcomes(self, run: ComparedRun) -> Sequence[Outcome]:
+        """Return the predictions of a run's model that are right or wrong for a recording, for frames of cameras."""
+        return []
 
     def columns(
         self, context: Context, comparison: Comparison

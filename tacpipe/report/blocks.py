@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -230,7 +231,29 @@ class Fold:
     about: str = ""  # a few words next to the heading
 
 
-Block = Table | Chart | SmallPrint | Charts | Fold
+@dataclass(frozen=True)
+class Picture:
+    """An image in JPEG, what it shows, and small text below."""
+
+    content: bytes
+    text: str
+    below: str = ""
+
+    @property
+    def source(self) -> str:
+        """The image as the source of an HTML element."""
+        return f"data:image/jpeg;base64,{base64.b64encode(self.content).decode()}"
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Images next to each other."""
+
+    title: str
+    pictures: Sequence[Picture]
+
+
+Block = Table | Chart | SmallPrint | Charts | Pictures | Fold
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.report.blocks import Block, Chart, Charts, Fold, Section, listed
+from tacpipe.report.frames import holds_cameras
 from tacpipe.report.sections import section
 
 if TYPE_CHECKING:
@@ -150,4 +151,7 @@ def _render(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
 
 def _users(dataset: Dataset, tasks: Mapping[str, TaskReport]) -> list[str]:
     """Return the tasks whose section can use a dataset that is not a result."""
+    with_outcomes = [name for name, task in tasks.items() if type(task).outcomes is not TaskReport.outcomes]
+    if with_outcomes and holds_cameras(dataset):
+        return with_outcomes
     return [name for name, task in tasks.items() if task.uses(dataset)]

@@ -14,7 +14,7 @@ from tacpipe.comparison.runs import MODEL, TaskReport, grouped
 from tacpipe.io import Json
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
-from tacpipe.report import blocks, charts, context, screen
+from tacpipe.report import blocks, charts, context, frames, screen
 from tacpipe.report.blocks import (
     NONE,
     Cell,
@@ -105,6 +105,7 @@ def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequen
     folds = [
         *everything(context),
         *task.folds(context),
+        *frames.frame_folds([outcome for run in runs[:1] for outcome in task.outcomes(run)], extra_datasets),
         *recordings(context),
         *every_run(context),
         *unread,
