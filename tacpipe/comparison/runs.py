@@ -225,7 +225,7 @@ CONFIG = "config.json"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RecordingOutcome:
     """The prediction of a model for a recording."""
 
     recording: str
@@ -266,7 +266,7 @@ class TaskReport:
         """Return whether the page can use a dataset that is not a result."""
         return False
 
-    def outcomes(self, run: ComparedRun) -> Sequence[Outcome]:
+    def outcomes(self, run: ComparedRun) -> Sequence[RecordingOutcome]:
         """Return the predictions of a run's model that are right or wrong for a recording, for frames of cameras."""
         return []
 

@@ -246,14 +246,14 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class PictureRow:
     """Images next to each other."""
 
     title: str
     pictures: Sequence[Picture]
 
 
-Block = Table | Chart | SmallPrint | Charts | Pictures | Fold
+Block = Table | Chart | SmallPrint | Charts | PictureRow | Fold
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import Outcome
-from tacpipe.report.blocks import Fold, Picture, Pictures, fold, notes
+from tacpipe.comparison.runs import RecordingOutcome
+from tacpipe.report.blocks import Fold, Picture, PictureRow, fold, notes
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
@@ -21,7 +21,7 @@ def holds_cameras(dataset: Dataset) -> bool:
     return any(_cameras(recording) for recording in dataset.recordings.values())
 
 
-def frame_folds(outcomes: Sequence[Outcome], datasets: Sequence[Dataset]) -> list[Fold]:
+def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset]) -> list[Fold]:
     """Return a fold with frames of right and of wrong predictions; empty without cameras of these recordings.
 
     A frame is in the middle of its recording, or of the recording's part in another of ``datasets``, such as a slide.
@@ -44,7 +44,7 @@ def frame_folds(outcomes: Sequence[Outcome], datasets: Sequence[Dataset]) -> lis
             for outcome in chosen
             for picture in _pictures(outcome, recordings[outcome.recording], parts.get(outcome.recording))
         ]
-        blocks += [Pictures(title, pictures)] if pictures else []
+        blocks += [PictureRow(title, pictures)] if pictures else []
     if not blocks:
         return []
     right = sum(outcome.is_right for outcome in seen)
@@ -60,7 +60,7 @@ def _cameras(recording: Recording) -> list[str]:
     return [name for name in recording.streams if read_format(recording.columns(name)) is not None]
 
 
-def _spread(outcomes: Sequence[Outcome]) -> list[Outcome]:
+def _spread(outcomes: Sequence[RecordingOutcome]) -> list[RecordingOutcome]:
     """Return at most `SHOWN` outcomes, evenly spaced by recording."""
     ordered = sorted(outcomes, key=lambda outcome: outcome.recording)
     if len(ordered) <= SHOWN:
@@ -68,7 +68,7 @@ def _spread(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return [ordered[row] for row in np.linspace(0, len(ordered) - 1, SHOWN).round().astype(int).tolist()]
 
 
-def _pictures(outcome: Outcome, recording: Recording, part: Recording | None) -> list[Picture]:
+def _pictures(outcome: RecordingOutcome, recording: Recording, part: Recording | None) -> list[Picture]:
     """Return a picture of each camera of a recording."""
     from tacpipe.video.decoding import read_frames
     from tacpipe.video.encoding import encode_images, jpeg_format

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import ComparedRun, Kind, Method, Outcome, TaskReport
+from tacpipe.comparison.runs import ComparedRun, Kind, Method, RecordingOutcome, TaskReport
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint
 from tacpipe.report.context import Context
@@ -38,13 +38,13 @@ class MaterialReport(TaskReport):
         """Return whether a dataset contains slides, which the report draws."""
         return figures.holds_slides(dataset)
 
-    def outcomes(self, run: ComparedRun) -> Sequence[Outcome]:
+    def outcomes(self, run: ComparedRun) -> Sequence[RecordingOutcome]:
         """Return whether the model named each unseen slide right."""
         predictions = run.details.predictions
         expected = predictions.named(predictions.materials)
         predicted = predictions.named(predictions.predicted[MODEL])
         return [
-            Outcome(str(recording), str(label), str(name), bool(label == name))
+            RecordingOutcome(str(recording), str(label), str(name), bool(label == name))
             for recording, label, name in zip(predictions.recordings, expected, predicted, strict=True)
         ]
 
