@@ -246,14 +246,14 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class PictureRow:
+class ImageRow:
     """Images next to each other."""
 
     title: str
     pictures: Sequence[Picture]
 
 
-Block = Table | Chart | SmallPrint | Charts | PictureRow | Fold
+Block = Table | Chart | SmallPrint | Charts | ImageRow | Fold
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.comparison.runs import RecordingOutcome
-from tacpipe.report.blocks import Fold, Picture, PictureRow, fold, notes
+from tacpipe.report.blocks import Fold, Picture, ImageRow, fold, notes
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
@@ -44,7 +44,7 @@ def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset
             for outcome in chosen
             for picture in _pictures(outcome, recordings[outcome.recording], parts.get(outcome.recording))
         ]
-        blocks += [PictureRow(title, pictures)] if pictures else []
+        blocks += [ImageRow(title, pictures)] if pictures else []
     if not blocks:
         return []
     right = sum(outcome.is_right for outcome in seen)

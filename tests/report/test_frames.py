@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.comparison.runs import RecordingOutcome
+from tacpipe.comparison.runs import RecordingOutcome as Outcome
 from tacpipe.report import page
-from tacpipe.report.blocks import PictureRow, Section
+from tacpipe.report.blocks import ImageRow, Section
 from tacpipe.report.frames import SHOWN, frame_folds, holds_cameras
 from tests.exports.test_videos import decoded
 from tests.fake_recordings import FakeRecording
@@ -36,16 +36,16 @@ def shown(fold: Any) -> dict[str, list[str]]:
     return {
         block.title: [picture.text for picture in block.pictures]
         for block in fold.blocks
-        if isinstance(block, PictureRow)
+        if isinstance(block, ImageRow)
     }
 
 
 def test_right_and_wrong_predictions_have_frames_with_the_label(path: Path) -> None:
     cameras = dataset({"gel": frames_of(path)}, "abc")
     outcomes = [
-        RecordingOutcome("a", "cup", "cup", True),
-        RecordingOutcome("b", "cup", "box", False),
-        RecordingOutcome("x", "cup", "cup", True),
+        Outcome("a", "cup", "cup", True),
+        Outcome("b", "cup", "box", False),
+        Outcome("x", "cup", "cup", True),
     ]
     (fold,) = frame_folds(outcomes, [cameras])
     assert shown(fold) == {"Right": ["cup"], "Wrong": ["box, and it is cup"]}
@@ -56,7 +56,7 @@ def test_a_frame_is_in_the_middle_of_the_part_that_the_model_read(path: Path) ->
     cameras = dataset({"gel": frames_of(path)}, "a")
     part = dataset({"": pa.table({"t_ns": [20 * 40_000_000, 24 * 40_000_000], "x": [0.0, 1.0]})}, "a")
     for datasets, row in (([cameras], 15), ([cameras, part], 22)):
-        (fold,) = frame_folds([RecordingOutcome("a", "cup", "cup", True)], datasets)
+        (fold,) = frame_folds([Outcome("a", "cup", "cup", True)], datasets)
         (picture,) = fold.blocks[0].pictures  # type: ignore[union-attr]
         (image,) = decoded("mjpeg", [picture.content])
         assert np.abs(image.astype(int) - videos.decoded(path)[row]).mean() < 6
@@ -66,17 +66,17 @@ def test_a_frame_is_in_the_middle_of_the_part_that_the_model_read(path: Path) ->
 def test_at_most_a_few_of_many_predictions_are_shown(path: Path) -> None:
     names = "abcdefgh"
     cameras = dataset({"gel": frames_of(path)}, names)
-    (fold,) = frame_folds([RecordingOutcome(name, name, name, True) for name in names], [cameras])
+    (fold,) = frame_folds([Outcome(name, name, name, True) for name in names], [cameras])
     assert len(shown(fold)["Right"]) == SHOWN
 
 
 def test_without_cameras_there_is_no_fold() -> None:
     other = dataset({"arm": pa.table({"t_ns": [0, 1], "x": [0.0, 1.0]})}, "a")
     assert not holds_cameras(other)
-    assert frame_folds([RecordingOutcome("a", "cup", "cup", True)], [other]) == []
+    assert frame_folds([Outcome("a", "cup", "cup", True)], [other]) == []
 
 
 def test_the_page_contains_the_images(path: Path) -> None:
-    folds = frame_folds([RecordingOutcome("a", "cup", "cup", True)], [dataset({"gel": frames_of(path)}, "a")])
+    folds = frame_folds([Outcome("a", "cup", "cup", True)], [dataset({"gel": frames_of(path)}, "a")])
     text = page.page([Section("material", "Material", "", folds=folds)], "Results").decode()
     assert '<img src="data:image/jpeg;base64,' in text and "<small>a, gel, 0.60 s</small>" in text
