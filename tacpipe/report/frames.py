@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.comparison.runs import RecordingOutcome
-from tacpipe.report.blocks import Fold, Picture, ImageRow, fold, notes
+from tacpipe.report.blocks import Fold, ImageRow, Picture, fold, notes
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
