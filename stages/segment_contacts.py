@@ -84,6 +84,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     import numpy as np
     import pyarrow as pa
 
+    from tacpipe.arrays import from_arrow, to_arrow
     from tacpipe.io.columns import change
     from tacpipe.io.parquet import with_metadata
     from tacpipe.signals.contact import (
@@ -96,7 +97,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     )
 
     columns = recording.columns()
-    t_ns = columns.column("t_ns").to_numpy()  # (time,)
+    t_ns = from_arrow(columns.column("t_ns"))  # (time,)
     columns.forget()
     loads: list[Floats] = []
     limits: list[Thresholds] = []
@@ -110,7 +111,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
         def blocks(names: Sequence[str] = names) -> Iterator[AnyArray]:
             for table in columns.batches(names):
-                yield np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
+                yield np.column_stack([from_arrow(table.column(name)) for name in names])  # (time, channel)
 
         axes = count_axes(schema, names)
         level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
@@ -137,7 +138,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
 
     def mark(table: pa.Table, first: int) -> pa.Table:
-        contact = pa.array(numbers[first : first + table.num_rows])
+        contact = to_arrow(numbers[first : first + table.num_rows])
         return with_metadata(table.append_column(field, contact), rest_metadata)
 
     return RecordingOutput(change(columns, mark), _threshold_attributes(units, limits, fixed), notes)

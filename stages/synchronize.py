@@ -23,7 +23,7 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Int64s, Times
+    from tacpipe.arrays import AnyArray, Int64s, Times
     from tacpipe.datasets.dataset import Recording
     from tacpipe.synchronization.streams import TimedStream
 
@@ -147,16 +147,25 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     schema = pa.schema([kind for kind, _ in columns])
 
     def table(rows: slice) -> pa.Table:
-        return pa.Table.from_arrays([pa.array(values[rows], kind.type) for kind, values in columns], schema=schema)
+        return pa.Table.from_arrays([_column(values[rows], kind.type) for kind, values in columns], schema=schema)
 
     def batches() -> Iterator[pa.RecordBatch]:
         for first in range(0, len(grid_ns), BATCH_ROWS):
             yield from (batch := table(slice(first, first + BATCH_ROWS))).to_batches()
             storage.read(batch.nbytes)
 
-    gaps = {kind.name: pa.array(values) for kind, values in columns if kind.name.endswith(masks.GAP)}
+    gaps = pa.Table.from_pydict(
+        {kind.name: _column(values, kind.type) for kind, values in columns if kind.name.endswith(masks.GAP)}
+    )
     result = table(slice(None)) if storage.in_memory else pa.RecordBatchReader.from_batches(schema, batches())
-    return RecordingOutput(result, attributes, masks.describe_gaps(pa.table(gaps)))
+    return RecordingOutput(result, attributes, masks.describe_gaps(gaps))
+
+
+def _column(values: AnyArray | pa.Array, kind: pa.DataType) -> pa.Array:
+    """Return values that are an array of numpy or of pyarrow as a column of type ``kind``."""
+    from tacpipe.arrays import to_arrow
+
+    return to_arrow(values, kind) if hasattr(values, "dtype") else values
 
 
 def _stream_on_grid(

@@ -237,6 +237,7 @@ def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 def forget() -> None:
     """Make the registry look again for what is installed."""
     registry.installed.cache_clear()
+    registry.provider_of.cache_clear()
     registry.entry_points.cache_clear()
     registry.stages.cache_clear()
     architectures.kinds.cache_clear()

@@ -69,6 +69,12 @@ def test_ingest_does_not_import_torch(tmp_path: Path, lab: Path) -> None:
     assert "torch" not in imported(lab, "synchronize data/recordings -o data/other --rate-hz 20 --jobs 1")
 
 
+@pytest.mark.parametrize("words", ["synchronize data/recordings", "segment contacts data/synced"])
+def test_synchronizing_and_segmenting_import_no_pandas(lab: Path, words: str) -> None:
+    changed = "--rate-hz 21" if words.startswith("sync") else "--min-s 0.031"
+    assert "pandas" not in imported(lab, f"{words} -o data/without-pandas-{words[:3]} {changed} --jobs 1")
+
+
 @pytest.mark.parametrize("task", ["forward", "material", "touch"])
 def test_the_report_of_a_task_imports_no_torch(task: str) -> None:
     lines = (

@@ -237,8 +237,10 @@ def gap_mask(table: pa.Table) -> Bools:
 
 def gap_shares(table: pa.Table | Columns) -> dict[str, float]:
     """Return the fraction of rows in a gap of each stream, by stream."""
+    from tacpipe.arrays import from_arrow
+
     masks = [name for name in table.column_names if name.endswith(GAP)]
-    return {name.removesuffix(GAP): float(table.column(name).to_numpy().mean()) for name in masks if table.num_rows}
+    return {name.removesuffix(GAP): float(from_arrow(table.column(name)).mean()) for name in masks if table.num_rows}
 
 
 def describe_gaps(*tables: pa.Table | Columns) -> list[str]:

@@ -6,7 +6,6 @@ With a remote store, results are uploaded while other tasks are computed.
 from __future__ import annotations
 
 import contextlib
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -56,14 +55,16 @@ class _Computing:
         for task in tasks:
             if (task.store, task.run) not in stores:
                 stores[task.store, task.run] = opened(task.store, task.run)
-        if len(tasks) >= _MANY and any(store.distant for store in stores.values()):
-            try:
-                yield from _overlap_tasks([(task, stores[task.store, task.run]) for task in tasks])
-            finally:
-                for store in stores.values():
-                    store.close()
-        else:
-            yield from map(self, tasks)
+        pairs = [(task, stores[task.store, task.run]) for task in tasks]
+        try:
+            if len(tasks) >= _MANY and any(store.distant for store in stores.values()):
+                yield from _overlap_tasks(pairs)
+            else:
+                for task, store in pairs:
+                    yield _begin(task, store)()
+        finally:
+            for store in stores.values():
+                store.close()
 
 
 compute = _Computing()
@@ -151,7 +152,7 @@ class _Sending:
                     replace=computed.replace,
                     durable=computed.durable,
                 )
-                shutil.rmtree(execution.workspace(store, digest(task.identity)), ignore_errors=True)
+                execution.remove_workspace(store, task)
         except TacpipeError as error:
             return _failure(task, store, error)
         return Done(task.recording, record)

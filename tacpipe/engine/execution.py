@@ -325,6 +325,12 @@ def _begun_workspace(store: Store, key: str) -> Path:
     return folder
 
 
+def remove_workspace(store: Store, task: WorkerTask) -> None:
+    """Remove the checkpoints of a finished training."""
+    if "Workspace" in registry.load_step(task.name).arguments.values():
+        shutil.rmtree(workspace(store, digest(task.identity)), ignore_errors=True)
+
+
 def remove_empty_workspace(store: Store, key: str) -> None:
     """Remove the workspace of a training that saved no checkpoint."""
     folder = workspace(store, key)

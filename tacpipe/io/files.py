@@ -139,18 +139,25 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
         return False
 
 
-@contextlib.contextmanager
-def readable_errors(root: Path, *, reading: bool = False) -> Iterator[None]:
+class readable_errors:  # noqa: N801  (a context manager; a generator would take five times as long)
     """Convert file system errors in the block to a sentence, except errors about missing files.
 
     With ``reading``, nothing is written in the block, and the sentence is that of `read_error`.
     """
-    try:
-        yield
-    except (FileNotFoundError, FileExistsError):
-        raise
-    except OSError as error:
-        raise (read_error(error.filename or root, error) if reading else sentence(root, error)) from error
+
+    __slots__ = ("_reading", "_root")
+
+    def __init__(self, root: Path | str, *, reading: bool = False) -> None:
+        self._root, self._reading = root, reading
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
+        """Raise a `StorageError` in place of a file system error."""
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | FileExistsError):
+            root, reading = self._root, self._reading
+            raise (read_error(error.filename or root, error) if reading else sentence(root, error)) from error
 
 
 def may_not_write(error: StorageError) -> bool:

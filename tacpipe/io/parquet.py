@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from tacpipe.arrays import from_arrow
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory, regular, row_groups
 from tacpipe.io.parquet_claims import Claims
@@ -31,6 +32,7 @@ PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 rows could exce
 GROUP_BYTES = 1 << 28  # encoded frames per row group
 TRIED_BYTES = 1 << 20  # encoded frames that are compressed as a trial
 WORTH = 0.95  # maximum ratio of compressed to original size for which compression is used
+THREADED_BYTES = 1 << 22  # size in memory above which columns are decoded by several threads; starting them takes time
 SOME_ROWS = 1 << 14  # rows decoded at once when a file is read in batches
 ZSTD_LEVEL = 3
 ZSTD_LEVEL_REPEATED = 9  # long runs of equal values justify the slower search
@@ -228,7 +230,8 @@ class ParquetTable:
         total, largest, _ = self._count(columns)
         memory.require(total + largest, f"A Parquet file of {self._size} bytes", error=ShortageError)
         try:
-            return self._attach_metadata(self._file.read(columns=list(columns) if columns is not None else None))
+            names = list(columns) if columns is not None else None
+            return self._attach_metadata(self._file.read(columns=names, use_threads=total > THREADED_BYTES))
         except BROKEN as error:
             raise _read_error(self._size, error) from error
 
@@ -340,7 +343,7 @@ def _repeated_share(table: pa.Table, release: Callable[[], None]) -> float:
         return 0.0
     same = np.ones(table.num_rows - 1, dtype=bool)  # (time,)
     for column in channels:
-        channel = column.to_numpy()
+        channel = from_arrow(column)
         same &= channel[1:] == channel[:-1]
         release()
     return float(same.mean())

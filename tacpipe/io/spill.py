@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray
+from tacpipe.arrays import AnyArray, from_arrow, is_numeric
 from tacpipe.errors import StorageError
 from tacpipe.io.files import sentence
 from tacpipe.io.parquet import owned
@@ -199,10 +199,7 @@ class MappedArrays:
         """Return a column of the same values; one of texts, or with nulls, stays in memory. Raises as `empty`."""
         if isinstance(column, np.ndarray):
             return self.kept(column)
-        import pyarrow.types as kinds
-
-        number = kinds.is_integer(column.type) or kinds.is_floating(column.type)
-        return self.kept(column.to_numpy()) if number and not column.null_count else column
+        return self.kept(from_arrow(column)) if is_numeric(column) else column
 
     @property
     def in_memory(self) -> bool:

@@ -87,6 +87,7 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
     return targets_by_group
 
 
+@functools.cache
 def provider_of(group: str, name: str) -> Package | None:
     """Return the package that provides an entry point, from its metadata, or None for tacpipe's own.
 

@@ -128,7 +128,7 @@ def foreign(root: Path) -> list[str]:
 def is_linked(root: str, path: str | Path) -> bool:
     """Return whether a file of the store is in a folder that is a symbolic link; the store's own folder may be one."""
     folder = os.path.dirname(path)  # noqa: PTH120
-    with readable_errors(Path(root)):
+    with readable_errors(root):
         return folder != root and _is_link(folder)
 
 

@@ -174,7 +174,7 @@ class Announcing:
         new = [name for name in names if name not in self._read_lease]
         if not new:
             return
-        with readable_errors(Path(self.path).parent):
+        with readable_errors(os.path.dirname(self.path)):  # noqa: PTH120
             if self._handle < 0:
                 try:
                     self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)

@@ -352,7 +352,7 @@ class Store:
 
         The prefix shows a collection whether the run that wrote the file has ended.
         """
-        return f"{self._root}/tmp/{Path(self.run).stem}.{name or uuid.uuid4().hex}"
+        return f"{self._root}/tmp/{os.path.basename(self.run).removesuffix('.lock')}.{name or uuid.uuid4().hex}"  # noqa: PTH119
 
     # ---- records
 

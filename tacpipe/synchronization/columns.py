@@ -11,7 +11,7 @@ from tacpipe.synchronization.streams import TimedStream
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Bools, Floats, Int64s, Times
+    from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
 
 MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with as many readings, delayed by 10 ms
@@ -22,20 +22,18 @@ BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated 
 
 def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
     """Return field and values of each channel on the grid, in the order of the stream. ``keep`` stores each."""
-    import pyarrow as pa
-
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
-        return [_channel_at_rows(stream, name, pa.array(exact), "none", keep) for name in stream.channels]
+        return [_channel_at_rows(stream, name, exact, "none", keep) for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
         groups.setdefault(streams.method(stream.columns.schema, name), []).append(name)
     grid_columns: dict[str, GridColumn] = {}
     if "nearest" in groups:
-        rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
+        nearest = nearest_rows(stream.t_ns, grid_ns)
         for name in groups.pop("nearest"):
-            grid_columns[name] = _channel_at_rows(stream, name, rows, "nearest", keep)
+            grid_columns[name] = _channel_at_rows(stream, name, nearest, "nearest", keep)
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         interpolation = method.partition(" ")[0]
@@ -57,11 +55,9 @@ def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[Gri
     The value is the newest sample, with the same type; for a proximity sensor, the median of the last
     `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it. ``keep`` stores each channel.
     """
-    import pyarrow as pa
-
     from tacpipe.signals.resampling import median_before, newest_rows
 
-    rows = pa.array(newest_rows(stream.t_ns, grid_ns))
+    rows = newest_rows(stream.t_ns, grid_ns)
     grid_columns = []
     for name in stream.channels:
         if streams.method(stream.columns.schema, name) == "median":
@@ -74,7 +70,7 @@ def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[Gri
     return grid_columns
 
 
-def _channel_at_rows(stream: TimedStream, name: str, rows: pa.Array, interpolation: str, keep: Keep) -> GridColumn:
+def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolation: str, keep: Keep) -> GridColumn:
     """Return field and values of a channel at ``rows`` with the same type; ``interpolation`` names the method."""
     return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
 

@@ -15,7 +15,7 @@ from tacpipe.plugins.stage import Attribute
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Bools, Int32s, Int64s, Times
+    from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times
     from tacpipe.io.columns import Columns
 
 
@@ -122,19 +122,19 @@ class TimedStream:
 
     def values(self, name: str) -> AnyArray:
         """Return a numeric channel (time,)."""
-        unwrapped_values = self.unwrapped.get(name)
-        return self.columns.column(name).to_numpy() if unwrapped_values is None else unwrapped_values
-
-    def at(self, name: str, rows: pa.Array) -> pa.Array:
-        """Return a channel of any type at ``rows``."""
-        import pyarrow as pa
+        from tacpipe.arrays import from_arrow
 
         unwrapped_values = self.unwrapped.get(name)
-        return (
-            self.columns.column(name).take(rows).combine_chunks()
-            if unwrapped_values is None
-            else pa.array(unwrapped_values).take(rows)
-        )
+        return from_arrow(self.columns.column(name)) if unwrapped_values is None else unwrapped_values
+
+    def at(self, name: str, rows: Indices) -> AnyArray | pa.Array:
+        """Return a channel of any type at ``rows``; numbers without nulls are an array of numpy."""
+        from tacpipe.arrays import from_arrow, is_numeric, to_arrow
+
+        if name in self.unwrapped:
+            return self.unwrapped[name][rows]
+        column = self.columns.column(name)
+        return from_arrow(column)[rows] if is_numeric(column) else column.take(to_arrow(rows)).combine_chunks()
 
     @property
     def truth(self) -> bool:
@@ -187,6 +187,7 @@ def _convert_device_times(
     """Return the device times of samples converted to the host's clock, and attributes of the fit."""
     import pyarrow as pa
 
+    from tacpipe.arrays import from_arrow
     from tacpipe.signals.clocks import fit_clock, host_times
 
     column = columns.column(DEVICE)
@@ -195,7 +196,7 @@ def _convert_device_times(
             f"Recording {recording}: {DEVICE} of stream {stream!r} is {column.type} with {column.null_count} empty rows; "
             f"it must be integer nanoseconds in each row. Correct it at the source, or use `--clock arrival`."
         )
-    device_ns = column.cast(pa.int64()).to_numpy()
+    device_ns = from_arrow(column.cast(pa.int64()))
     try:
         fit = fit_clock(device_ns, arrival_ns, _certain(columns))
     except TacpipeError as error:
@@ -209,9 +210,11 @@ def _convert_device_times(
 
 def _certain(columns: Columns) -> Bools | None:
     """Return a mask of the rows whose arrival was not delayed, or None for all."""
+    from tacpipe.arrays import from_arrow
+
     if UNCERTAIN not in columns.column_names:
         return None
-    certain: Bools = columns.column(UNCERTAIN).to_numpy() == 0
+    certain: Bools = from_arrow(columns.column(UNCERTAIN)) == 0
     return certain
 
 
@@ -219,12 +222,14 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
     """Return the arrival times of a stream. Raises `TacpipeError` if there are none, or they decrease."""
     import numpy as np
 
+    from tacpipe.arrays import from_arrow
+
     if "t_ns" not in columns.column_names or not columns.num_rows:
         raise TacpipeError(
             f"Recording {recording}: stream {stream!r} has no rows with t_ns. Exclude the recording with "
             f"`tacpipe label --exclude`, or record it again."
         )
-    t_ns: Times = columns.column("t_ns").to_numpy()
+    t_ns: Times = from_arrow(columns.column("t_ns"))
     decreases = np.diff(t_ns) < 0
     if decreases.any():
         row = int(decreases.argmax()) + 1
@@ -242,13 +247,14 @@ def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[Time
     """
     import pyarrow as pa
 
+    from tacpipe.arrays import from_arrow
     from tacpipe.signals.repairs import unwrap
 
     changed: dict[str, Int32s] = {}
     for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
         if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
-            values = stream.columns.column(kind.name).to_numpy()
+            values = from_arrow(stream.columns.column(kind.name))
             unwrapped_values = unwrap(values)
             if unwrapped_values is not values:
                 changed[kind.name] = keep(unwrapped_values)
@@ -259,12 +265,13 @@ def _repeated_rows(columns: Columns) -> Bools:
     """Return a mask of rows that repeat the previous one in all channels except labels, which are often constant."""
     import numpy as np
 
+    from tacpipe.arrays import from_arrow
     from tacpipe.signals.repairs import repeated_in_columns
 
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
     if not names:
         return np.zeros(columns.num_rows, dtype=bool)
-    return repeated_in_columns(columns.column(name).to_numpy() for name in names)
+    return repeated_in_columns(from_arrow(columns.column(name)) for name in names)
 
 
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
