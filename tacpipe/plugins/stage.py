@@ -319,7 +319,7 @@ class Requirements:
 
     def to_text(self) -> str:
         """Return the requirements as lines of text."""
-        chain = ", then ".join(f"tacpipe {stage}" for stage in self.stages)
+        chain = ", then ".join(f"tacpipe {stage}" for stage in self.stages) or "any stage, or recordings as they are"
         lines = [f"tacpipe train {self.task} reads the output of", f"  {chain}"]
         lines += [f"  (optional: {stage})" for stage in self.optional_stages]
         lines += ["", "roles in the split", *_wrap(self.roles, "  "), ""]

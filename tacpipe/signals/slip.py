@@ -19,11 +19,12 @@ Readings are in counts, rates in counts per second.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Bools, Floats
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.filters import butterworth, median, trailing_median
 from tacpipe.signals.runs import in_long_runs, in_long_runs_online, latch, runs
@@ -185,3 +186,68 @@ def _departure_row(moved: Floats, level_count: float) -> int | None:
     following = float(moved[min(first + 1, len(moved) - 1)])
     growth = (following / float(moved[first])) ** 0.5 - 1 if following > moved[first] else 0.0
     return first - (min(int(1 / growth), CORNER_ROWS) if growth > 0 else 0)
+
+
+@dataclass(frozen=True)
+class LossOfContact:
+    """The motion that ends the last contact of a recording."""
+
+    begin_ns: int  # start of the motion
+    end_ns: int  # last contact
+
+
+@dataclass(frozen=True)
+class HoldingPhases:
+    """When an object is touched, by the difference from the untouched sensor at the end of a recording."""
+
+    t_ns: Times  # (time,)
+    touched: Bools  # (time,)
+    loss: LossOfContact | None  # None if nothing is touched, or not for long enough
+
+
+@dataclass(frozen=True)
+class TouchLimits:
+    """Criteria for contact and motion, in the unit of the channels."""
+
+    end_rows: int  # last rows, whose median shows the untouched sensor
+    contact_level: float  # root mean square over channels
+    contact_fraction: float  # of the 90th percentile of the level
+    contact_s: float  # shortest contact before a loss
+    motion_level: float  # root mean square change between two rows
+    quiet_s: float  # time without motion, or without contact, that separates two motions or contacts
+
+
+def loss_of_contact(streams: Sequence[tuple[Times, AnyFloats]], limits: TouchLimits) -> HoldingPhases:
+    """Return when an object is touched, from times (time,) and channels (time, channel) of each stream.
+
+    The largest level and motion over the streams count, at the times of the first stream.
+    """
+    t_ns = streams[0][0]
+    levels, speeds = np.zeros(len(t_ns)), np.zeros(len(t_ns))
+    for times, values in streams:
+        rows = np.clip(np.searchsorted(times, t_ns, side="right") - 1, 0, len(times) - 1)
+        end = np.median(values[-limits.end_rows :], axis=0)
+        level = np.sqrt(np.square(values - end).mean(axis=1))
+        speed = np.sqrt(np.square(np.diff(values, axis=0, prepend=values[:1])).mean(axis=1))
+        levels, speeds = np.maximum(levels, level[rows]), np.maximum(speeds, speed[rows])
+    quiet_rows = max(1, round(limits.quiet_s * 1e9 / max(1.0, float(np.median(np.diff(t_ns))))))
+    threshold = max(limits.contact_level, limits.contact_fraction * float(np.quantile(levels, 0.9)))
+    touched = _close_gaps(levels > threshold, quiet_rows)
+    starts, stops = runs(touched)
+    if not len(starts) or t_ns[stops[-1] - 1] - t_ns[starts[-1]] < limits.contact_s * 1e9:
+        return HoldingPhases(t_ns, touched, None)
+    first, last = int(starts[-1]), int(stops[-1]) - 1
+    moving = _close_gaps(speeds > limits.motion_level, quiet_rows)
+    begin = last
+    while begin > first and moving[begin - 1 : begin + 1].any():
+        begin -= 1
+    return HoldingPhases(t_ns, touched, LossOfContact(int(t_ns[begin]), int(t_ns[last])))
+
+
+def _close_gaps(active: Bools, rows: int) -> Bools:
+    """Return which rows are active, or in a gap of fewer than ``rows`` rows between active ones (time,)."""
+    closed = active.copy()
+    for begin, stop in zip(*runs(~active), strict=True):
+        if stop - begin < rows and begin > 0 and stop < len(active):
+            closed[begin:stop] = True
+    return closed

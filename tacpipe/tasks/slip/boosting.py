@@ -1,0 +1,130 @@
+"""Gradient-boosted trees (Friedman, 2001), grown by scikit-learn's histograms and kept as arrays.
+
+What scikit-learn keeps of a model is a pickle, which may run code when an untrusted one is opened. Kept here are the cuts
+and the values of the leaves, from which the same scores follow. Scoring needs numpy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Int32s
+
+LEAF = -1  # the child of a node without children
+
+
+@dataclass(frozen=True)
+class BoostedTrees:
+    """Trees side by side in arrays of all nodes, each tree beginning at one of ``roots``."""
+
+    roots: Int32s  # (tree,)
+    children: Int32s  # (node, left or right); LEAF at a leaf
+    features: Int32s  # (node,)
+    cuts: Floats  # (node,); a row goes left where its feature is at most that
+    missing_left: Int32s  # (node,), 1 where a row without the feature goes left
+    values: Floats  # (node,)
+    base: Floats  # (1,), the score before the first tree
+
+    @classmethod
+    def fitted(
+        cls,
+        rows: AnyFloats,
+        labels: Bools,
+        weights: AnyFloats,
+        *,
+        trees: int,
+        leaves: int,
+        leaf: int,
+        learning_rate: float,
+        l2: float,
+        seed: int,
+    ) -> BoostedTrees:
+        """Return trees that score rows (row, feature) by the log odds of their ``labels`` (row,).
+
+        Without features, there is no tree, and the score is that of the weighted fraction of labels.
+        """
+        if not rows.shape[1]:
+            return cls.constant(float(np.average(labels, weights=weights)))
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        model = HistGradientBoostingClassifier(
+            max_iter=trees,
+            max_leaf_nodes=leaves,
+            min_samples_leaf=leaf,
+            learning_rate=learning_rate,
+            l2_regularization=l2,
+            early_stopping=False,
+            random_state=seed,
+        )
+        model.fit(rows, labels, sample_weight=weights)
+        grown = [stage[0].nodes for stage in model._predictors]
+        starts = np.cumsum([0, *map(len, grown)])[:-1]
+        nodes = np.concatenate(grown)
+        offsets = np.repeat(starts, [len(tree) for tree in grown])
+        is_leaf = nodes["is_leaf"].astype(bool)
+        pairs = np.column_stack([nodes["left"], nodes["right"]]).astype(np.int64) + offsets[:, None]
+        return cls(
+            starts.astype(np.int32),
+            np.where(is_leaf[:, None], LEAF, pairs).astype(np.int32),
+            np.where(is_leaf, 0, nodes["feature_idx"]).astype(np.int32),
+            np.where(is_leaf, 0.0, np.minimum(nodes["num_threshold"], np.finfo(np.float64).max)),
+            nodes["missing_go_to_left"].astype(np.int32),
+            nodes["value"].astype(np.float64),
+            np.ravel(model._baseline_prediction).astype(np.float64)[:1],
+        )
+
+    @classmethod
+    def constant(cls, probability: float) -> BoostedTrees:
+        """Return no trees, with the log odds of a probability as the score of each row."""
+        none = np.zeros(0, np.int32)
+        odds = np.log(probability / (1 - probability))
+        return cls(none, np.zeros((0, 2), np.int32), none, np.zeros(0), none, np.zeros(0), np.array([odds]))
+
+    def scores(self, rows: AnyFloats) -> Floats:
+        """Return the log odds of rows (row, feature): the sum of the leaves that a row falls into."""
+        node = np.broadcast_to(self.roots, (len(rows), len(self.roots))).copy()  # (row, tree)
+        row = np.arange(len(rows))[:, None]
+        while True:
+            value = rows[row, self.features[node]]
+            left = np.where(np.isnan(value), self.missing_left[node] > 0, value <= self.cuts[node])
+            child = self.children[node, np.where(left, 0, 1)]
+            if (child == LEAF).all():
+                break
+            node = np.where(child == LEAF, node, child)
+        scores: Floats = self.base[0] + self.values[node].sum(axis=1)
+        return scores
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """Return what `from_arrays` reads."""
+        return {field.name: np.ascontiguousarray(getattr(self, field.name)) for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], features: int) -> BoostedTrees:
+        """Return the trees that `arrays` wrote.
+
+        Raises `ValueError` unless they read at most so many features, and each way down them ends.
+        """
+        trees = cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        nodes = len(trees.values)
+        numbers = np.arange(nodes)[:, None]
+        checks = {
+            "roots": trees.roots.ndim == 1 and bool(((trees.roots >= 0) & (trees.roots < nodes)).all()),
+            # a child is behind its parent, so that no way down leads back
+            "children": trees.children.shape == (nodes, 2)
+            and bool((((trees.children > numbers) & (trees.children < nodes)) | (trees.children == LEAF)).all())
+            and bool(((trees.children == LEAF).sum(axis=1) != 1).all()),
+            "features": trees.features.shape == (nodes,)
+            and bool(((trees.features >= 0) & (trees.features < features)).all()),
+            "cuts": trees.cuts.shape == (nodes,) and trees.missing_left.shape == (nodes,),
+            "base": trees.base.shape == (1,),
+            "integers": all(
+                part.dtype.kind == "i" for part in (trees.roots, trees.children, trees.features, trees.missing_left)
+            ),
+        }
+        wrong = next((name for name, fine in checks.items() if not fine), "")
+        if wrong:
+            raise ValueError(f"the {wrong} of boosted trees of {nodes} nodes are out of range")
+        return trees

@@ -1,0 +1,255 @@
+"""Evaluate a slip model next to its baselines, on recordings that it was not trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.datasets import model_files
+from tacpipe.errors import TacpipeError
+from tacpipe.io.parquet import from_parquet, to_parquet
+from tacpipe.metrics import headline, pairing
+from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.plugins.stage import Result
+from tacpipe.tasks.slip import metrics
+from tacpipe.tasks.slip.calibration import ScoredTrack
+from tacpipe.tasks.slip.metrics import WindowScores
+from tacpipe.tasks.slip.model import SlipModel
+from tacpipe.tasks.slip.scorers import CONSTANT, score_baselines
+from tacpipe.tasks.slip.training import TASK, labelled_tracks, score_windows, scored_tracks
+from tacpipe.tasks.slip.windows import STABLE, TrainingWindows, match_time, read_windows
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+MODEL = "model"
+WINDOWS, EVENTS = "windows.parquet", "events.json"
+
+
+def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return the metrics of a model and of its baselines. Raises `TacpipeError` if no unseen recording has slip labels."""
+    model = SlipModel.load(files)
+    seen = set(model.config["trained_on"].values())
+    tracks = [track for track in labelled_tracks(model.reader, recordings) if track.digest not in seen]
+    if not tracks:
+        raise TacpipeError(
+            "No recording has labels of slips, except those that the model was trained on. Give recordings with the role "
+            "test, with labels."
+        )
+    windows = read_windows(model.reader, tracks, replace(model.params, match_time=True))
+    scores = {MODEL: score_windows(model.scorer, windows), **score_baselines(model.baselines, windows.features)}
+    base_rate = float(model.config["base_rate"])
+    probabilities = {
+        MODEL: model.calibration.probability(scores[MODEL]),
+        **{name: 1 / (1 + np.exp(-values)) for name, values in scores.items() if name not in (MODEL, CONSTANT)},
+        CONSTANT: np.full(len(windows), base_rate),
+    }
+    levels = {MODEL: model.calibration.levels, **model.config["baseline_levels"]}
+    evaluated = EvaluatedSlips.from_windows(windows, scores, probabilities, levels)
+    architecture = str(model.config["architecture"])
+    compared = headline_of(architecture, evaluated)
+    return Result(
+        files={
+            model_files.CONFIG: files[model_files.CONFIG],
+            "metrics.json": model_files.to_json(evaluated.measure(model.horizon_ns)),
+            WINDOWS: evaluated.to_parquet(),
+            EVENTS: evaluated.events_json(),
+            headline.FILE: headline.write([compared] if compared else []),
+        }
+    )
+
+
+@dataclass(frozen=True)
+class EvaluatedSlips:
+    """The counted windows of evaluated recordings with the scores of all predictors."""
+
+    tracks: tuple[ScoredTrack, ...]  # with the scores of the model
+    scores: Mapping[str, tuple[Floats, ...]]  # predictor -> recording -> (row,)
+    probabilities: Mapping[str, tuple[Floats, ...]]
+    levels: Mapping[
+        str, Mapping[str, Mapping[str, float]]
+    ]  # recording -> predictor -> false alarms per minute -> level
+
+    @classmethod
+    def from_windows(
+        cls,
+        windows: TrainingWindows,
+        scores: Mapping[str, Floats],
+        probabilities: Mapping[str, Floats],
+        levels: Mapping[str, Mapping[str, float]],
+    ) -> EvaluatedSlips:
+        """Return the evaluation of windows, by the scores and probabilities (window,) of each predictor."""
+        tracks = tuple(scored_tracks(windows, scores[MODEL]))
+
+        def split(values: Mapping[str, Floats]) -> dict[str, tuple[Floats, ...]]:
+            parts = [windows.track == number for number in range(len(tracks))]
+            return {name: tuple(column[part] for part in parts) for name, column in values.items()}
+
+        return cls(tracks, split(scores), split(probabilities), {track.name: levels for track in tracks})
+
+    def pooled(self, others: Sequence[EvaluatedSlips]) -> EvaluatedSlips:
+        """Return this evaluation with those of further folds, matched for time again."""
+        parts = [self, *others]
+        tracks = [track for part in parts for track in part.tracks]
+        since_s, slips = (
+            np.concatenate([np.zeros(0), *values])
+            for values in ([track.since_s for track in tracks], [track.states > STABLE for track in tracks])
+        )
+        weights = match_time(since_s, slips > 0)
+        ends = np.cumsum([len(track.t_ns) for track in tracks])[:-1]
+        matched = [replace(track, weights=own) for track, own in zip(tracks, np.split(weights, ends), strict=True)]
+
+        def join(column: str) -> dict[str, tuple[Floats, ...]]:
+            return {name: tuple(row for part in parts for row in getattr(part, column)[name]) for name in self.scores}
+
+        levels = {name: by_predictor for part in parts for name, by_predictor in part.levels.items()}
+        return EvaluatedSlips(tuple(matched), join("scores"), join("probabilities"), levels)
+
+    def scored_by(self, predictor: str) -> list[ScoredTrack]:
+        """Return the recordings with the scores of a predictor."""
+        return [
+            replace(track, scores=scores) for track, scores in zip(self.tracks, self.scores[predictor], strict=True)
+        ]
+
+    def measure(self, horizon_ns: int) -> dict[str, Any]:
+        """Return the metrics of each predictor, and the margin of the model over each baseline."""
+        windows = {name: WindowScores(self.scored_by(name)) for name in self.scores}
+        draws = metrics.object_draws(windows[MODEL].object_count)
+        by_predictor: dict[str, Any] = {}
+        for name, own in windows.items():
+            probabilities = np.concatenate([np.zeros(0), *self.probabilities[name]])
+            brier = metrics.brier(probabilities, own.states > STABLE, own.weights)
+            by_predictor[name] = {
+                "auc": metrics.areas(own, draws),
+                "brier": float(f"{brier:.6g}") if brier == brier else None,
+                "alarms": self.alarms(name, horizon_ns, draws),
+            }
+            if name != MODEL:
+                by_predictor[name]["margin"] = metrics.margin(windows[MODEL], own, draws)
+        counts = {
+            "recordings": len(self.tracks),
+            "objects": windows[MODEL].object_count,
+            "slips": sum(len(track.events) for track in self.tracks),
+            "windows": len(windows[MODEL].scores),
+            "before": int((windows[MODEL].states > STABLE).sum()),
+        }
+        return {**by_predictor, "counts": counts, "parts": metrics.PARTS}
+
+    def alarms(self, predictor: str, horizon_ns: int, draws: Floats) -> dict[str, metrics.SlipAlarmScore]:
+        """Return the score of a predictor's alarm for each rate of false alarms; empty for a constant."""
+        tracks = self.scored_by(predictor)
+        rates = next(iter(self.levels.values())).get(predictor, {})
+        return {
+            rate: metrics.score_alarm(
+                tracks, {track.name: self.levels[track.name][predictor][rate] for track in tracks}, horizon_ns, draws
+            )
+            for rate in rates
+        }
+
+    def sums(self, predictor: str) -> Sums:
+        """Return the weighted sum of squared errors of probabilities, and the weights, by recording."""
+        return {
+            (0, track.name): np.array(
+                [(track.weights * np.square(values - (track.states > STABLE))).sum(), track.weights.sum()]
+            )
+            for track, values in zip(self.tracks, self.probabilities[predictor], strict=True)
+        }
+
+    def to_parquet(self) -> bytes:
+        """Return the table of all windows."""
+
+        def column(values: Sequence[Any]) -> Any:
+            return np.concatenate(values)
+
+        sizes = [len(track.t_ns) for track in self.tracks]
+        table = {
+            "recording": pa.array(np.repeat([track.name for track in self.tracks], sizes)),
+            "object": pa.array(np.repeat([track.object for track in self.tracks], sizes)),
+            "t_ns": pa.array(column([track.t_ns for track in self.tracks]), pa.int64()),
+            "since_s": pa.array(column([track.since_s for track in self.tracks])),
+            "state": pa.array(column([track.states for track in self.tracks]), pa.int8()),
+        }
+        for name in self.scores:
+            table[f"score_{name}"] = pa.array(column(self.scores[name]))
+            table[f"probability_{name}"] = pa.array(column(self.probabilities[name]))
+        return to_parquet(pa.table(table))
+
+    def events_json(self) -> bytes:
+        """Return the slips and the alarm levels of each recording."""
+        content = {
+            track.name: {"object": track.object, "slips": track.events.tolist(), "levels": self.levels[track.name]}
+            for track in self.tracks
+        }
+        return model_files.to_json(content)
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> EvaluatedSlips:
+        """Return the evaluation of a result."""
+        table = from_parquet(files[WINDOWS])
+        described = model_files.tree(files, EVENTS)
+        names = table["recording"].to_numpy(zero_copy_only=False)
+        predictors = [name.removeprefix("score_") for name in table.column_names if name.startswith("score_")]
+        values = {name: table[name].to_numpy() for name in table.column_names if name not in ("recording", "object")}
+        tracks, places = [], []
+        for name, own in sorted(described.items()):
+            place = np.flatnonzero(names == name)
+            places.append(place)
+            events = np.array(own["slips"], np.int64).reshape(-1, 2)
+            since_s = values["since_s"][place]
+            tracks.append(
+                ScoredTrack(
+                    name,
+                    str(own["object"]),
+                    values["t_ns"][place],
+                    values["state"][place].astype(np.int64),
+                    values[f"score_{MODEL}"][place],
+                    events,
+                    np.ones(len(place)),
+                    since_s,
+                )
+            )
+
+        def column(prefix: str) -> dict[str, tuple[Floats, ...]]:
+            return {name: tuple(values[f"{prefix}_{name}"][place] for place in places) for name in predictors}
+
+        levels = {name: own["levels"] for name, own in described.items()}
+        return cls(tuple(tracks), column("score"), column("probability"), levels).pooled([])
+
+
+def brier_measure() -> Measure:
+    """Return the conversion of sums of squared errors and weights to Brier scores."""
+
+    def error(sums: AnyFloats) -> AnyFloats:
+        return np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1e-12), np.nan)
+
+    def gain(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
+        return np.where(baseline > 0, 1 - model / np.where(baseline > 0, baseline, 1), np.nan)
+
+    return Measure(
+        ("Brier score",),
+        "squared probability",
+        "the Brier score",
+        "skill",
+        "objects",
+        error,
+        gain,
+        lambda sums: (float(error(sums[None])[0]),),
+        scored="Brier score",
+        weight=lambda draws: draws[:, 1],
+        reference="time only",
+    )
+
+
+def headline_of(method: str, evaluated: EvaluatedSlips) -> headline.Headline | None:
+    """Return the Brier score of the model next to those of its baselines, with the interval over objects."""
+    baselines: dict[str, Sums] = {
+        name.replace("_", " "): evaluated.sums(name) for name in evaluated.scores if name != MODEL
+    }
+    objects = {track.name: track.object for track in evaluated.tracks}
+    measure = brier_measure()
+    return pairing.headline(TASK, method, measure, evaluated.sums(MODEL), baselines, clusters=objects)

@@ -1,0 +1,237 @@
+"""Measure scores of slips: area under the curve by kind of window, lead times, and intervals over objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypedDict
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s
+from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
+from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
+
+LEADS_S = (0.2, 0.5, 1.0)  # times before the start of a slip at which the area under the curve is measured
+LEAD_WIDTH_S = 0.1  # half the width of the windows around such a time
+EARLY_S = (2.0, 3.0)  # times before the start of a slip of the control of windows that are too early
+DRAWS = 1000  # draws of objects per interval
+INTERVAL = (0.025, 0.975)
+SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
+
+PARTS = {  # kinds of windows of the area under the curve -> meaning
+    "before": "windows in the horizon before a slip, against stable contact matched for time",
+    "during": "windows during a slip (detection), against stable contact matched for time",
+    "early": "windows 2 to 3 s before a slip, against recordings without a slip: the grasp, not the moment",
+    "within": "windows before a slip against earlier windows of the same recording: the moment, not the grasp",
+    **{f"lead {lead:g} s": f"windows {lead:g} s before a slip, against matched stable contact" for lead in LEADS_S},
+}
+
+
+class ObjectEstimate(TypedDict):
+    """A value with its 95 % interval over objects; null where it is undefined."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+class SlipAlarmScore(TypedDict):
+    """Score of an alarm over all slips."""
+
+    events: int
+    predicted: int  # slips with an alarm before they began
+    detected: int  # slips with an alarm before they ended, including predicted ones
+    median_lead_ms: float | None  # of predicted slips, from the alarm to the start of the slip
+    median_to_end_ms: float | None  # of detected slips, from the alarm to the end of the slip
+    false_alarms: int
+    minutes: float  # stable contact
+    false_alarms_per_minute: float | None
+    predicted_ratio: ObjectEstimate
+    detected_ratio: ObjectEstimate
+
+
+@dataclass(frozen=True)
+class Area:
+    """An area under the curve as sums by object, from which that of any draw of objects follows."""
+
+    wins: Floats  # (object of the slip, object of the stable contact), weighted pairs in which the slip scores higher
+    positives: Floats  # (object,), weight of windows with a slip
+    negatives: Floats | None  # (object,), weight of stable windows; None if pairs are within one object
+
+    @property
+    def value(self) -> float:
+        """The area over all objects; NaN without pairs."""
+        return float(self.drawn(np.ones((1, len(self.positives))))[0])
+
+    def drawn(self, draws: Floats) -> Floats:
+        """Return the area (draw,) of each draw of objects (draw, object)."""
+        if self.negatives is None:
+            won, pairs = draws @ np.diag(self.wins), draws @ self.positives
+        else:
+            won = ((draws @ self.wins) * draws).sum(axis=1)
+            pairs = (draws @ self.positives) * (draws @ self.negatives)
+        area: Floats = np.where(pairs > 0, won / np.where(pairs > 0, pairs, 1), np.nan)
+        return area
+
+
+def _wins(slips: AnyFloats, stable: AnyFloats, weights: AnyFloats) -> Floats:
+    """Return the weight of stable scores below each score of a slip (slip,), half for equal ones."""
+    order = np.argsort(stable, kind="stable")
+    cumulative = np.concatenate([[0.0], np.cumsum(weights[order])])
+    left, right = (cumulative[np.searchsorted(stable[order], slips, side=side)] for side in SIDES)
+    wins: Floats = (left + right) / 2
+    return wins
+
+
+class WindowScores:
+    """All counted windows of several recordings with the scores of one predictor."""
+
+    def __init__(self, tracks: Sequence[ScoredTrack]) -> None:
+        self.tracks = list(tracks)
+        sizes = [len(track.t_ns) for track in self.tracks]
+        self.recording = np.repeat(np.arange(len(sizes)), sizes)
+        names = sorted({track.object for track in self.tracks})
+        self.objects = np.array([names.index(track.object) for track in self.tracks], np.intp)[self.recording]
+        self.object_count = len(names)
+        self.scores = _joined([track.scores for track in self.tracks])
+        self.states = _joined([track.states for track in self.tracks]).astype(np.int64)
+        self.weights = _joined([track.weights for track in self.tracks])
+        self.until_s = _joined([_until_next(track) for track in self.tracks])
+        self.has_slip = _joined([np.full(len(track.t_ns), bool(len(track.events))) for track in self.tracks]) > 0
+
+    def part(self, name: str) -> tuple[Bools, Bools]:
+        """Return which windows a part of `PARTS` counts, and which of them are positive (window,)."""
+        stable = self.states == STABLE
+        if name == "before":
+            return (self.states == BEFORE) | stable, self.states == BEFORE
+        if name == "during":
+            return (self.states == DURING) | stable, self.states == DURING
+        if name == "early":
+            early = stable & (self.until_s >= EARLY_S[0]) & (self.until_s <= EARLY_S[1])
+            return early | (stable & ~self.has_slip), early
+        if name == "within":
+            return ((self.states == BEFORE) | stable) & self.has_slip, self.states == BEFORE
+        lead_s = float(name.split()[1])
+        near = (self.states == BEFORE) & (np.abs(self.until_s - lead_s) <= LEAD_WIDTH_S)
+        return near | stable, near
+
+    def area(self, name: str) -> Area:
+        """Return the area under the curve of a part, as sums by object.
+
+        WindowScores of the part within are compared in each recording only.
+        """
+        counted, positive = self.part(name)
+        weights = np.ones(len(self.scores)) if name in ("within", "early") else self.weights
+        negative = counted & ~positive
+        positives, negatives = (np.zeros(self.object_count) for _ in range(2))
+        np.add.at(positives, self.objects[positive], weights[positive])
+        np.add.at(negatives, self.objects[negative], weights[negative])
+        if name == "within":
+            return self._within(counted, positive)
+        wins = np.zeros((self.object_count, self.object_count))
+        for number in np.unique(self.objects[negative]).tolist():
+            rows = negative & (self.objects == number)
+            gained = _wins(self.scores[positive], self.scores[rows], weights[rows])
+            np.add.at(wins[:, number], self.objects[positive], gained * weights[positive])
+        return Area(wins, positives, negatives)
+
+    def _within(self, counted: Bools, positive: Bools) -> Area:
+        """Return the mean of the areas of recordings, weighted by their windows before a slip."""
+        wins, totals = np.zeros((self.object_count, self.object_count)), np.zeros(self.object_count)
+        for number in np.unique(self.recording[counted & positive]).tolist():
+            rows = counted & (self.recording == number)
+            before, earlier = (self.scores[rows & kind] for kind in (positive, ~positive))
+            if len(earlier):
+                place = int(self.objects[rows][0])
+                wins[place, place] += _wins(before, earlier, np.full(len(earlier), 1 / len(earlier))).sum()
+                totals[place] += len(before)
+        return Area(wins, totals, None)
+
+
+def _until_next(track: ScoredTrack) -> Floats:
+    """Return the seconds from each row to the next start of a slip (row,), infinite without one."""
+    starts = np.append(track.events[:, 0], np.iinfo(np.int64).max)
+    following = starts[np.searchsorted(track.events[:, 0], track.t_ns, side="left")]
+    return np.where(following == starts[-1], np.inf, (following - track.t_ns) / 1e9)
+
+
+def _joined(parts: Sequence[AnyFloats | Bools | Int64s]) -> AnyFloats:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def object_draws(count: int, seed: int = 0) -> Floats:
+    """Return how often each object is in each draw with replacement (draw, object)."""
+    rng = np.random.default_rng(seed)
+    return np.stack([np.bincount(rng.integers(count, size=count), minlength=count) for _ in range(DRAWS)]).astype(
+        np.float64
+    )
+
+
+def estimate(value: float, draws: AnyFloats) -> ObjectEstimate:
+    """Return a value with the interval of its draws (draw,); NaN becomes null."""
+    finite = draws[np.isfinite(draws)]
+    low, high = np.quantile(finite, INTERVAL) if len(finite) >= DRAWS // 2 else (np.nan, np.nan)
+    numbers = (value, float(low), float(high))
+    texts = [float(f"{number:.6g}") if np.isfinite(number) else None for number in numbers]
+    return {"value": texts[0], "low": texts[1], "high": texts[2]}
+
+
+def areas(windows: WindowScores, draws: Floats) -> dict[str, ObjectEstimate]:
+    """Return the area under the curve of each part, with intervals over objects from ``draws`` (draw, object)."""
+    by_part = {name: windows.area(name) for name in PARTS}
+    return {name: estimate(area.value, area.drawn(draws)) for name, area in by_part.items()}
+
+
+def margin(model: WindowScores, baseline: WindowScores, draws: Floats, name: str = "before") -> ObjectEstimate:
+    """Return by how much the area of a model exceeds that of a baseline, with its interval over the same objects."""
+    first, second = model.area(name), baseline.area(name)
+    return estimate(first.value - second.value, first.drawn(draws) - second.drawn(draws))
+
+
+def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:
+    """Return the weighted mean squared difference of probabilities and slips (window,); NaN without weight."""
+    total = float(weights.sum())
+    return float((weights * np.square(probabilities - slips)).sum() / total) if total else float("nan")
+
+
+def score_alarm(
+    tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | float, horizon_ns: int, draws: Floats
+) -> SlipAlarmScore:
+    """Return the score of an alarm; ``levels`` are one for all recordings or one by recording name."""
+    events: list[EventScore] = []
+    false = 0
+    for track in tracks:
+        level = levels[track.name] if isinstance(levels, Mapping) else levels
+        events += score_events(track, level, horizon_ns)
+        false += false_alarms(track, level, horizon_ns)
+    minutes = stable_minutes(tracks)
+    names = sorted({track.object for track in tracks})
+    predicted = np.array([event.lead_ms == event.lead_ms for event in events], bool)
+    detected = np.array([event.to_end_ms == event.to_end_ms for event in events], bool)
+    owners = np.array([names.index(event.object) for event in events], np.intp)
+
+    def ratio(flags: Bools) -> ObjectEstimate:
+        if not len(flags):
+            return estimate(float("nan"), np.zeros(0))
+        with np.errstate(invalid="ignore"):
+            drawn = np.array([np.divide((draw[owners] * flags).sum(), draw[owners].sum()) for draw in draws])
+        return estimate(float(flags.mean()), drawn)
+
+    return {
+        "events": len(events),
+        "predicted": int(predicted.sum()),
+        "detected": int(detected.sum()),
+        "median_lead_ms": _median([event.lead_ms for event in events]),
+        "median_to_end_ms": _median([event.to_end_ms for event in events]),
+        "false_alarms": false,
+        "minutes": float(f"{minutes:.6g}"),
+        "false_alarms_per_minute": float(f"{false / minutes:.6g}") if minutes else None,
+        "predicted_ratio": ratio(predicted),
+        "detected_ratio": ratio(detected),
+    }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    finite = [value for value in values if value == value]
+    return float(f"{np.median(finite):.6g}") if finite else None

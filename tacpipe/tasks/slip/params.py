@@ -1,0 +1,176 @@
+"""Params of `tacpipe train slip`, which define how a slip model is built and trained; one class per architecture."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypedDict
+
+from tacpipe.errors import UsageError
+from tacpipe.plugins.constraints import (
+    Names,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Seed,
+    Unit,
+)
+from tacpipe.plugins.params import Panels
+from tacpipe.tasks.task import ModelConfig
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tacpipe.tasks.slip.scorers import Scorer
+    from tacpipe.tasks.slip.windows import TrainingWindows
+
+
+@dataclass(frozen=True)
+class SlipModelParams(ABC):
+    """Params of all slip models."""
+
+    ARCHITECTURES: ClassVar[str] = "slip"  # name of the task in entry points
+    architecture: str = "boosting"
+    streams: Names = ""  # names of tactile streams to read; empty: all
+    # time that the model looks back; 0: only the current row
+    window_s: Annotated[float, Range(0, 60), Unit("s")] = 1.0
+    horizon_s: Annotated[PositiveFloat, Unit("s")] = 1.0  # time ahead for which the probability is stated
+    # time at the start of a recording whose mean is the level at rest; 0: values are relative to rest already
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
+    # time after a slip that is neither slip nor stable contact
+    recovery_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5
+    stride: PositiveInt = 1  # rows between two training windows
+    # weight training windows so that slip and stable contact have the same times since the start
+    match_time: bool = True
+    # slips of each training recording: its own, or shuffled over recordings, to show what a wrong label would score
+    labels: Literal["own", "shuffled"] = "own"
+    seed: Seed = 0  # random seed
+    PANELS: ClassVar[Panels] = {
+        "Model": (
+            *("architecture", "window_s", "horizon_s", "trees", "leaves", "leaf", "learning_rate", "l2"),
+            *("channels", "layers", "forward_model"),
+        ),
+        "Training": ("stride", "match_time", "labels", "epochs", "batch", "patience", "weight_decay", "seed"),
+        "Data": ("streams", "rest_s", "recovery_s"),
+    }
+
+    @abstractmethod
+    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+        """Return a scorer that was trained on ``windows``; ``workspace`` is a folder for checkpoints."""
+
+
+@dataclass(frozen=True)
+class Boosting(SlipModelParams):
+    """Gradient boosting on features of each finger."""
+
+    # boosting: gradient-boosted trees on features of each finger
+    architecture: Literal["boosting"] = "boosting"
+    trees: PositiveInt = 100  # number of trees
+    leaves: Annotated[int, Range(2)] = 6  # maximum number of leaves of a tree
+    leaf: PositiveInt = 200  # minimum number of windows per leaf
+    learning_rate: PositiveFloat = 0.08  # weight of each tree
+    l2: NonNegativeFloat = 50.0  # L2 penalty on leaf values
+
+    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+        """Grow the trees."""
+        from tacpipe.tasks.slip.scorers import BoostedScorer
+
+        return BoostedScorer.fitted(windows, self)
+
+
+@dataclass(frozen=True)
+class ConvolutionParams(SlipModelParams):
+    """A causal convolutional network on the channels of all fingers."""
+
+    # convolution: a causal convolutional network on the channels of all fingers
+    architecture: Literal["convolution"] = "convolution"
+    channels: PositiveInt = 24  # channels of each layer
+    layers: Annotated[int, Range(1, 8)] = 4  # layers; each doubles the time between the rows that it combines
+    epochs: PositiveInt = 15  # maximum number of passes over the training windows
+    batch: PositiveInt = 128  # windows per step of the optimiser
+    learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
+    weight_decay: NonNegativeFloat = 1e-3  # fraction of each weight that is added to its gradient
+    patience: PositiveInt = 3  # epochs without a lower error on held-out training recordings before training stops
+
+    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+        """Train the network by the shared loop."""
+        from tacpipe.tasks.slip.network import ConvolutionScorer
+
+        return ConvolutionScorer.fitted(windows, self, workspace)
+
+
+@dataclass(frozen=True)
+class ForecastRule(SlipModelParams):
+    """A rule on the forecast of a model of the task forward."""
+
+    # forecast-rule: the predicted rise and fall of shear, relative to the normal load
+    architecture: Literal["forecast-rule"] = "forecast-rule"
+    forward_model: str = ""  # path of a model of the task forward
+    forward_digest: str = ""  # digest of that model; computed if omitted
+
+    def __post_init__(self) -> None:
+        """Compute the digest of the forward model, which is part of the key."""
+        if not self.forward_model:
+            return
+        from tacpipe.datasets import manifest
+
+        digest = manifest.find(_path(self.forward_model)).digest
+        if self.forward_digest not in ("", digest):
+            raise UsageError(
+                f"{self.forward_model} has the digest {digest}, and forward_digest states {self.forward_digest}. Give the "
+                f"model that was used before, or leave forward_digest out."
+            )
+        object.__setattr__(self, "forward_digest", digest)
+
+    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+        """Return the rule; only its calibration depends on the training windows."""
+        from tacpipe.tasks.slip.rule import RuleScorer
+
+        if not self.forward_model:
+            raise UsageError("forward_model names no model. Give the path of a model of the task forward.")
+        return RuleScorer.fitted(windows, self)
+
+
+def _path(text: str) -> Path:
+    from pathlib import Path
+
+    return Path(text)
+
+
+Params = SlipModelParams  # params of any architecture
+
+
+class FingerConfig(TypedDict):
+    """A tactile stream that a model reads."""
+
+    stream: str
+    channels: list[str]
+    layout: list[dict[str, str]]  # taxel and axis of each channel, as far as its metadata names them
+    rows: int  # rows of a window
+    rate_hz: float
+    scale: list[float]  # (channel,), the divisor of values above rest
+
+
+class CalibrationConfig(TypedDict):
+    """A monotone map from scores to probabilities, and the alarm levels that follow from it."""
+
+    scores: list[float]  # (knot,), ascending
+    probabilities: list[float]  # (knot,)
+    method: str  # recordings that it was fitted to: validation, or out-of-fold training recordings
+    levels: dict[str, float]  # false alarms per minute -> score from which an alarm is on
+    minutes: float  # stable contact that the levels were set on
+
+
+class SlipConfig(ModelConfig):
+    """``config.json`` of a slip model."""
+
+    fingers: list[FingerConfig]
+    rate_hz: float  # rows of the first finger per second, at which probabilities are stated
+    objects: list[str]  # objects of the training recordings
+    counts: dict[str, int]  # recordings, windows and slips of the training
+    calibration: CalibrationConfig
+    scorer: dict[str, object]  # what the architecture stores next to its arrays
+    baselines: dict[str, dict[str, object]]  # what each baseline stores next to its arrays
+    baseline_levels: dict[str, dict[str, float]]  # baseline -> false alarms per minute -> level of its score
+    base_rate: float  # weighted fraction of training windows with a slip

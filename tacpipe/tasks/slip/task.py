@@ -1,0 +1,93 @@
+"""Define the task ``slip``: the probability that a held object slips within the next moment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tacpipe.plugins.stage import Channels, Label, Requirements, stage
+from tacpipe.tasks.slip.params import Params
+from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.plugins.stage import Result, Workspace
+    from tacpipe.tasks.recordings import OpenedChain
+    from tacpipe.tasks.slip.model import SlipModel
+
+REQUIREMENTS = Requirements(
+    "slip",
+    stages=(),
+    optional_stages=(
+        "extract difference or extract markers, for gels in front of a camera",
+        "segment losses or segment slips, for the labels",
+    ),
+    roles="recordings with and without slips with the role train; val for alarm levels",
+    channels=(
+        Channels(
+            "tactile",
+            (),
+            "taxels with axes x, y and z; markers with axes x and y; or any other tactile values, in rows at a nearly "
+            "constant rate",
+        ),
+        Channels(
+            "label",
+            ("1",),
+            "slip: 1 while the object slips; contact: negative while nothing is touched",
+            "Without slip, the label slip_intervals replaces it. Without contact, all rows count as contact.",
+        ),
+    ),
+    labels=(
+        Label(
+            "slip_intervals",
+            "intervals in seconds, as set by tacpipe label --interval",
+            "Without it, the column slip replaces it.",
+        ),
+        Label("object", "the held object, any text", "Without it, each recording counts as another object."),
+    ),
+)
+
+
+class SlipTask(Task):
+    """Predict slips of a held object."""
+
+    name = "slip"
+
+    @staticmethod
+    @stage(version=1, requirements=REQUIREMENTS, reads=("object", "slip_intervals"))
+    def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
+        """Train a model that predicts slips of a held object.
+
+        It states the probability that the object slips within the next second, and reads the last second of all tactile
+        streams. Validation recordings set the levels of alarms.
+
+        Example: tacpipe train slip data/slips --split data/split -o models/slip
+        """
+        from tacpipe.plugins.stage import Result
+        from tacpipe.tasks.slip import training
+
+        return Result(files=training.train(params, train, val, workspace))
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return areas under the curve, Brier scores and alarms; raises as `tacpipe.tasks.slip.evaluation`."""
+        from tacpipe.tasks.slip import evaluation
+
+        return evaluation.evaluate(model.files, recordings)
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return one table of probabilities per recording; raises as `tacpipe.tasks.slip.model`."""
+        from tacpipe.tasks.slip.model import predict
+
+        return predict(model.files, recordings)
+
+    def load(self, files: Files, chain: OpenedChain | None = None) -> SlipModel:
+        """Return the model in ``files``, trained behind the stages of ``chain``."""
+        from tacpipe.tasks.slip.model import SlipModel
+
+        return SlipModel.load(files, chain)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of probabilities by isotonic regression."""
+        from tacpipe.tasks.slip.model import calibrate
+
+        return Calibration("probabilities", calibrate)

@@ -1,0 +1,146 @@
+"""Models of the task slip: training, prediction, evaluation, calibration, and the files of a model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.slip import evaluation, training
+from tacpipe.tasks.slip.model import SlipModel, calibrate, predict
+from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule
+from tacpipe.tasks.slip.rule import score_forecasts
+from tacpipe.tasks.task import CalibrationRequest
+from tests.fake_recordings import dataset
+from tests.tasks.slip.slip_recordings import held_object, trials
+
+SMALL = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("workspace")
+    return training.train(SMALL, dataset(*trials(16)), dataset(*trials(6, 50)), folder)
+
+
+def test_a_model_finds_slips_of_unseen_recordings_before_they_begin(files: dict[str, bytes]) -> None:
+    result = evaluation.evaluate(files, dataset(*trials(12, 100)))
+    metrics = json.loads(result.files["metrics.json"])
+    assert metrics["model"]["auc"]["before"]["value"] > 0.9
+    assert metrics["model"]["alarms"]["10"]["predicted"] == metrics["counts"]["slips"] == 6
+    assert metrics["time_only"]["auc"]["before"]["value"] < 0.7
+    assert metrics["model"]["brier"] < metrics["constant"]["brier"]
+    assert metrics["constant"]["auc"]["before"]["value"] == 0.5
+
+
+def test_a_model_of_shuffled_labels_finds_no_slip(tmp_path: Path) -> None:
+    params = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2, labels="shuffled", seed=2)
+    files = training.train(params, dataset(*trials(40)), None, tmp_path)
+    metrics = json.loads(evaluation.evaluate(files, dataset(*trials(12, 100))).files["metrics.json"])
+    assert metrics["model"]["auc"]["before"]["value"] < 0.7
+
+
+def test_recordings_that_the_model_was_trained_on_are_not_evaluated(files: dict[str, bytes]) -> None:
+    with pytest.raises(TacpipeError, match="except those that the model was trained on"):
+        evaluation.evaluate(files, dataset(*trials(4)))
+
+
+def test_a_result_reads_back_as_it_was_evaluated(files: dict[str, bytes]) -> None:
+    result = evaluation.evaluate(files, dataset(*trials(6, 100)))
+    again = evaluation.EvaluatedSlips.from_files(result.files)
+    assert again.measure(1_000_000_000) == json.loads(result.files["metrics.json"])
+
+
+def test_a_prediction_states_probability_and_alarms_of_each_row_with_full_windows(files: dict[str, bytes]) -> None:
+    recording = held_object(101, 6.0)
+    table = predict(files, dataset(recording)).recordings[recording.name].streams[""]
+    assert table.column_names == ["t_ns", "probability", "score", "alarm_0.1", "alarm_1", "alarm_10"]
+    at_s = table["t_ns"].to_numpy() / 1e9
+    assert at_s[0] == pytest.approx(1.2, abs=0.06)  # rest of 0.2 s, then a window of 1 s
+    probability = table["probability"].to_numpy()
+    assert probability[(at_s > 5.5) & (at_s < 6)].mean() > 0.6 > 0.2 > probability[(at_s > 2) & (at_s < 4)].mean()
+
+
+def test_later_samples_change_no_earlier_probability(files: dict[str, bytes]) -> None:
+    recording = held_object(101, 6.0)
+    shortened = {name: table.slice(0, 150) for name, table in recording.tables.items()}
+    whole, part = (
+        predict(files, dataset(type(recording)(tables, "trial", recording.attributes))).recordings["trial"].streams[""]
+        for tables in (recording.tables, shortened)
+    )
+    assert 0 < part.num_rows < whole.num_rows
+    assert part.equals(whole.slice(0, part.num_rows))
+
+
+def test_a_single_window_scores_as_among_others(files: dict[str, bytes]) -> None:
+    model = SlipModel.load(files)
+    track = model.reader.track(held_object(103, 6.0))  # type: ignore[arg-type]
+    rows = np.flatnonzero(track.ready)
+    scores = model.scorer.score(model.reader, track, rows)
+    for row, score in list(zip(rows, scores, strict=True))[::17]:
+        windows = [
+            track.windows(np.array([row]), place, finger.rows)[0] for place, finger in enumerate(model.reader.fingers)
+        ]
+        assert model.scorer.score_window(model.reader, windows) == score
+
+
+def test_calibration_on_other_recordings_sets_levels_and_remembers_the_recordings(files: dict[str, bytes]) -> None:
+    request = CalibrationRequest((10, 90), False, 0.05, 0)
+    others = dataset(*trials(6, 200))
+    calibrated = SlipModel.load(calibrate(files, request, dataset(), others))
+    assert calibrated.calibration.method == "calibration recordings"
+    assert set(others.recordings) <= set(calibrated.config["trained_on"])
+    with pytest.raises(TacpipeError, match="have no slip"):
+        calibrate(files, request, dataset(), dataset(held_object(300, None)))
+
+
+def test_a_network_learns_and_loads_with_the_same_scores(tmp_path: Path) -> None:
+    params = ConvolutionParams(channels=6, layers=3, epochs=2, stride=4, batch=64)
+    files = training.train(params, dataset(*trials(8)), dataset(*trials(4, 50)), tmp_path)
+    first, second = (
+        predict(files, dataset(held_object(101, 6.0))).recordings["trial-101"].streams[""] for _ in range(2)
+    )
+    assert first.equals(second)
+    assert np.ptp(first["score"].to_numpy()) > 0
+
+
+@pytest.mark.parametrize(
+    ("recordings", "message"),
+    [
+        ([held_object(0, None), held_object(2, None)], "no window with a slip"),
+        ([], "no training recording"),
+    ],
+)
+def test_recordings_that_teach_nothing_are_refused(recordings: list[Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match=message):
+        training.train(SMALL, dataset(*recordings), None, tmp_path)
+
+
+def test_files_of_another_model_are_refused(files: dict[str, bytes]) -> None:
+    config = json.loads(files["config.json"])
+    config["fingers"] = config["fingers"][:1]
+    damaged = {**files, "config.json": json.dumps(config).encode()}
+    with pytest.raises(TacpipeError, match="do not fit one another"):
+        SlipModel.load(damaged)
+
+
+def test_a_rule_without_a_forward_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TacpipeError, match="names no model"):
+        training.train(ForecastRule(), dataset(*trials(4)), None, tmp_path)
+
+
+def test_the_rule_scores_the_rise_and_the_fall_of_the_predicted_shear() -> None:
+    values = {"x": {1: 1.0, 3: 3.0, 5: 2.0}, "y": {1: 0.0, 3: 0.0, 5: 0.0}, "z": {1: 2.0, 3: 2.0, 5: 2.0}}
+    fields, columns = [pa.field("t_ns", pa.int64())], [pa.array([0])]
+    for axis, by_step in values.items():
+        for step, value in by_step.items():
+            about = {"quantity": "prediction", "stream": "left", "axis": axis, "step": str(step)}
+            fields.append(pa.field(f"left_{axis}_t{step}", pa.float32(), metadata=about))
+            columns.append(pa.array([value], pa.float32()))
+    table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
+    assert score_forecasts(table).tolist() == [1.5]  # rises by 2 and falls by 1, at a load of 2

@@ -1,0 +1,244 @@
+"""WindowScores of touch, their labels, and the arithmetic of scores."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.metrics import roc_auc_score
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.tasks.slip import calibration, metrics
+from tacpipe.tasks.slip.boosting import BoostedTrees
+from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
+from tacpipe.tasks.slip.features import FingerLayout, finger_features
+from tacpipe.tasks.slip.labels import read_labels
+from tacpipe.tasks.slip.params import Boosting
+from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE, UNCOUNTED, match_time, read_training, shuffle_labels
+from tests.fake_recordings import FakeRecording, dataset
+from tests.tasks.slip.slip_recordings import held_object, trials
+
+AXES = FingerLayout.from_layout([{"axis": axis} for axis in "xyzxyz"])
+PLAIN = FingerLayout.from_layout([{}, {}, {}, {}, {}, {}])
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    arrays(np.float64, st.tuples(st.integers(2, 9), st.integers(1, 30), st.just(6)), elements=st.floats(-1e3, 1e3)),
+    st.sampled_from([AXES, PLAIN]),
+)
+def test_a_window_has_the_same_features_by_itself_as_among_others(windows: np.ndarray, layout: FingerLayout) -> None:
+    together = finger_features(windows, layout)
+    by_itself = np.concatenate([finger_features(window[None].copy(), layout) for window in windows])
+    assert together.tobytes() == by_itself.tobytes()
+
+
+def test_shear_over_load_is_that_of_the_means_of_taxels() -> None:
+    window = np.zeros((1, 4, 6))
+    window[0, :, [0, 3]] = 3.0  # x of both taxels
+    window[0, :, [1, 4]] = 4.0  # y
+    window[0, :, [2, 5]] = -10.0  # z
+    from tacpipe.tasks.slip.features import NAMES
+
+    features = dict(zip(NAMES, finger_features(window, AXES)[0], strict=True))
+    assert features["shear over load"] == pytest.approx(0.5)
+    assert features["spread of ratios"] == pytest.approx(0.0)
+    assert features["speed"] == 0.0
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(600, 5))
+    labels = rows[:, 0] * rows[:, 1] > 0.3
+    rows[rng.random(rows.shape) < missing] = np.nan
+    sizes = {"learning_rate": 0.2, "max_leaf_nodes": 8, "min_samples_leaf": 5, "l2_regularization": 1.0}
+    oracle = HistGradientBoostingClassifier(max_iter=20, early_stopping=False, random_state=3, **sizes)
+    oracle.fit(rows, labels, sample_weight=np.ones(600))
+    trees = BoostedTrees.fitted(
+        rows, labels, np.ones(600), trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3
+    )
+    assert trees.scores(rows) == pytest.approx(oracle.decision_function(rows), abs=1e-9)
+    loaded = BoostedTrees.from_arrays(trees.arrays(), 5)
+    assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
+
+
+def test_trees_whose_nodes_lead_back_are_refused() -> None:
+    rows = np.random.default_rng(0).normal(size=(100, 2))
+    trees = BoostedTrees.fitted(
+        rows, rows[:, 0] > 0, np.ones(100), trees=2, leaves=4, leaf=5, learning_rate=0.2, l2=1.0, seed=0
+    )
+    arrays_by_name = trees.arrays()
+    arrays_by_name["children"] = np.where(arrays_by_name["children"] > 0, 0, arrays_by_name["children"])
+    with pytest.raises(ValueError, match="children"):
+        BoostedTrees.from_arrays(arrays_by_name, 2)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_area_under_the_curve_is_that_of_scikit_learn_for_any_draw_of_objects(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tracks = []
+    for name in "abc":
+        states = np.where(rng.random(30) < 0.4, BEFORE, STABLE)
+        states[:2] = BEFORE, STABLE
+        track = scored(rng.integers(0, 6, 30).astype(float), states)
+        tracks.append(dataclasses.replace(track, name=name, object=name, weights=rng.random(30) + 0.1))
+    windows = metrics.WindowScores(tracks)
+    draws = np.array([[1.0, 1.0, 1.0], [2.0, 0.0, 1.0]])
+    expected = [
+        roc_auc_score(windows.states > 0, windows.scores, sample_weight=windows.weights * draw[windows.objects])
+        for draw in draws
+    ]
+    assert windows.area("before").drawn(draws) == pytest.approx(expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000))
+def test_matched_windows_with_and_without_a_slip_have_the_same_distribution_of_time(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    since_s = rng.random(200) * 8
+    slips = rng.random(200) < np.where(since_s < 4, 0.5, 0.1)
+    weights = match_time(since_s, slips)
+    bins = np.floor(since_s)
+    shares = []
+    for kind in (slips, ~slips):
+        total = weights[kind].sum()
+        shares.append([weights[kind & (bins == place)].sum() / total if total else 0.0 for place in range(8)])
+    assert shares[0] == pytest.approx(shares[1])
+
+
+def test_states_are_before_during_and_after_a_slip_and_unknown_at_the_end() -> None:
+    _, (track,) = read_training(dataset(held_object(1, 5.0)), Boosting())
+    states = track.states(1_000_000_000, 500_000_000)
+    at_s = track.since_s
+
+    def state(second: float) -> int:
+        return int(states[np.argmin(np.abs(at_s - second))])
+
+    assert [state(second) for second in (0.5, 2.0, 3.9, 4.1, 4.9, 5.0, 5.5, 5.7, 6.1, 8.9, 9.5)] == [
+        *(UNCOUNTED, STABLE, STABLE, BEFORE, BEFORE, DURING, DURING, UNCOUNTED, STABLE, STABLE, UNCOUNTED),
+    ]
+
+
+def test_rows_without_contact_are_not_counted() -> None:
+    recording = held_object(1, None)
+    table = recording.tables["left"]
+    import pyarrow as pa
+
+    contact = np.where(table["t_ns"].to_numpy() < 4_000_000_000, 0, -1).astype(np.int8)
+    with_contact = {**recording.tables, "left": table.append_column("contact", pa.array(contact))}
+    _, (track,) = read_training(dataset(dataclasses.replace(recording, tables=with_contact)), Boosting())
+    states = track.states(1_000_000_000, 0)
+    assert (states[track.since_s >= 4.0] == UNCOUNTED).all()
+    assert (states[(track.since_s > 2) & (track.since_s < 4)] == STABLE).all()
+
+
+def test_intervals_of_a_recording_replace_a_column_of_slips() -> None:
+    recording = held_object(1, 5.0, slip_intervals="2-2.5 7-7.25")
+    labels = read_labels(recording)  # type: ignore[arg-type]
+    assert labels is not None
+    assert (labels.events / 1e9).tolist() == [[2.0, 2.5], [7.0, 7.25]]
+    none = read_labels(dataclasses.replace(recording, attributes={"slip_intervals": ""}))  # type: ignore[arg-type]
+    assert none is not None
+    assert len(none.events) == 0
+
+
+def test_a_recording_without_labels_has_none_and_an_unknown_slip_is_no_label() -> None:
+    recording = held_object(1, None)
+    tables = {
+        name: table.drop_columns(["slip"]) if name == "left" else table for name, table in recording.tables.items()
+    }
+    assert read_labels(FakeRecording(tables)) is None  # type: ignore[arg-type]
+    import pyarrow as pa
+
+    unknown = tables["left"].append_column("slip", pa.array(np.full(tables["left"].num_rows, -1, np.int8)))
+    assert read_labels(FakeRecording({**tables, "left": unknown})) is None  # type: ignore[arg-type]
+
+
+def test_an_interval_that_is_no_interval_is_refused() -> None:
+    with pytest.raises(UsageError, match="is not an interval"):
+        read_labels(held_object(1, None, slip_intervals="from 2 to 3"))  # type: ignore[arg-type]
+
+
+def test_shuffled_labels_keep_the_number_of_slips_and_their_times() -> None:
+    _, tracks = read_training(dataset(*trials(8)), Boosting())
+    shuffled = shuffle_labels(tracks, 1)
+    assert sorted((track.events - track.start_ns).tolist() for track in tracks) == sorted(
+        (track.events - track.start_ns).tolist() for track in shuffled
+    )
+    assert [track.events.tolist() for track in tracks] != [track.events.tolist() for track in shuffled]
+
+
+def test_a_recording_of_other_channels_is_refused() -> None:
+    recording = held_object(2, None)
+    fewer = {**recording.tables, "right": recording.tables["right"].drop_columns(["taxel01_x"])}
+    with pytest.raises(TacpipeError, match="other tactile channels"):
+        read_training(dataset(held_object(1, None), dataclasses.replace(recording, tables=fewer)), Boosting())
+
+
+def scored(scores: np.ndarray, states: np.ndarray, events: list[list[int]] | None = None) -> ScoredTrack:
+    t_ns = np.arange(len(scores), dtype=np.int64) * 100_000_000
+    return ScoredTrack(
+        "a",
+        "b",
+        t_ns,
+        states,
+        scores,
+        np.array(events or [], np.int64).reshape(-1, 2),
+        np.ones(len(scores)),
+        t_ns / 1e9,
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([0.1, 1.0, 10.0, 60.0]))
+def test_alarms_at_their_level_are_never_more_than_allowed_where_it_was_set(seed: int, per_minute: float) -> None:
+    rng = np.random.default_rng(seed)
+    tracks = [
+        scored(rng.normal(size=300).round(1), np.where(rng.random(300) < 0.8, STABLE, UNCOUNTED)) for _ in range(3)
+    ]
+    level = calibration.alarm_level(tracks, per_minute, 1_000_000_000)
+    counted = sum(calibration.false_alarms(track, level, 1_000_000_000) for track in tracks)
+    assert counted <= per_minute * calibration.stable_minutes(tracks)
+
+
+def test_a_false_alarm_lasts_for_the_horizon() -> None:
+    scores = np.zeros(30)
+    scores[[2, 5, 20]] = 1.0  # 0.2, 0.5 and 2 s
+    assert calibration.false_alarms(scored(scores, np.zeros(30, np.int64)), 0.5, 1_000_000_000) == 2
+
+
+def test_an_alarm_before_a_slip_leads_it_and_one_during_it_detects_it() -> None:
+    states = np.zeros(40, np.int64)
+    states[10:20], states[20:25] = BEFORE, DURING
+    events = [[2_000_000_000, 2_400_000_000]]
+    scores = np.zeros(40)
+    scores[17] = 1.0
+    (early,) = calibration.score_events(scored(scores, states, events), 0.5, 1_000_000_000)
+    assert (early.lead_ms, early.to_end_ms) == (300.0, 700.0)
+    scores = np.zeros(40)
+    scores[22] = 1.0
+    (late,) = calibration.score_events(scored(scores, states, events), 0.5, 1_000_000_000)
+    assert np.isnan(late.lead_ms)
+    assert (late.detected_ms, late.to_end_ms) == (200.0, 200.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000))
+def test_probabilities_rise_with_the_score_and_are_calibrated_where_they_were_fitted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(size=500)
+    slips = rng.random(500) < 1 / (1 + np.exp(-2 * scores))
+    fitted = SlipCalibration.fitted(scores, slips, np.ones(500), [scored(scores, np.zeros(500, np.int64))], "x", 10**9)
+    probabilities = fitted.probability(np.sort(scores))
+    assert (np.diff(probabilities) >= 0).all()
+    assert 0 < probabilities.min() <= probabilities.max() < 1
+    assert fitted.probability(scores).mean() == pytest.approx(slips.mean(), abs=0.02)
+    again = SlipCalibration.from_config(fitted.to_config())
+    assert again.probability(scores).tobytes() == fitted.probability(scores).tobytes()
