@@ -110,5 +110,6 @@ def test_the_options_that_requirements_name_exist(task: str) -> None:
     stage = registry.load(f"train.{task}")
     assert stage.requirements is not None
     flags = {f"--{name.replace('_', '-')}" for name in params_of.fields(stage)}
-    flags |= {f"--{name.replace('_', '-')}" for name in params_of.fields(registry.load("segment.slides"))} | {"--from", "--interval"}
+    flags |= {f"--{name.replace('_', '-')}" for name in params_of.fields(registry.load("segment.slides"))}
+    flags |= {"--from", "--interval"}
     assert set(re.findall(r"--[a-z-]+", stage.requirements.to_text())) <= flags
