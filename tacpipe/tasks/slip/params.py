@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tacpipe.tasks.slip.scorers import Scorer
-    from tacpipe.tasks.slip.windows import TrainingWindows
+    from tacpipe.tasks.slip.training import SlipTraining
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class SlipModelParams(ABC):
     }
 
     @abstractmethod
-    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
-        """Return a scorer that was trained on ``windows``; ``workspace`` is a folder for checkpoints."""
+    def fit(self, training: SlipTraining) -> Scorer:
+        """Return a scorer; ``training`` has the windows to train on, and the methods that the task offers."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,9 @@ class Boosting(SlipModelParams):
     learning_rate: PositiveFloat = 0.08  # weight of each tree
     l2: NonNegativeFloat = 50.0  # L2 penalty on leaf values
 
-    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+    def fit(self, training: SlipTraining) -> Scorer:
         """Grow the trees."""
-        from tacpipe.tasks.slip.scorers import BoostedScorer
-
-        return BoostedScorer.fitted(windows, self)
+        return training.boost(self)
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,9 @@ class ConvolutionParams(SlipModelParams):
     weight_decay: NonNegativeFloat = 1e-3  # fraction of each weight that is added to its gradient
     patience: PositiveInt = 3  # epochs without a lower error on held-out training recordings before training stops
 
-    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+    def fit(self, training: SlipTraining) -> Scorer:
         """Train the network by the shared loop."""
-        from tacpipe.tasks.slip.network import ConvolutionScorer
-
-        return ConvolutionScorer.fitted(windows, self, workspace)
+        return training.train_network(self)
 
 
 @dataclass(frozen=True)
@@ -123,13 +119,11 @@ class ForecastRule(SlipModelParams):
             )
         object.__setattr__(self, "forward_digest", digest)
 
-    def fit(self, windows: TrainingWindows, workspace: Path) -> Scorer:
+    def fit(self, training: SlipTraining) -> Scorer:
         """Return the rule; only its calibration depends on the training windows."""
-        from tacpipe.tasks.slip.rule import RuleScorer
-
         if not self.forward_model:
             raise UsageError("forward_model names no model. Give the path of a model of the task forward.")
-        return RuleScorer.fitted(windows, self)
+        return training.apply_rule(self)
 
 
 def _path(text: str) -> Path:

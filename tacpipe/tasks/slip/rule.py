@@ -21,8 +21,7 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.tasks.slip.params import ForecastRule
-    from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
+    from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
 
 SMALLEST_LOAD = 1e-3  # smallest divisor, as a fraction of the largest load of a recording
 
@@ -66,11 +65,6 @@ class RuleScorer:
     path: str
     digest: str
     runs_live: bool = False  # the forecasts come from another model
-
-    @classmethod
-    def fitted(cls, windows: TrainingWindows, params: ForecastRule) -> RuleScorer:
-        """Return the rule, which learns nothing."""
-        return cls(params.forward_model, params.forward_digest)
 
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
         """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one."""

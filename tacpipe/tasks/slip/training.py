@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks import recordings
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
-from tacpipe.tasks.slip.params import Boosting, SlipConfig, SlipModelParams
+from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule, SlipConfig, SlipModelParams
 from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, baseline_columns
 from tacpipe.tasks.slip.windows import (
     FingerReader,
@@ -34,6 +35,32 @@ TASK = "slip"
 MODEL, BASELINES = "scorer.safetensors", "baselines.safetensors"
 FOLDS = 5  # folds of out-of-fold scores
 BASELINE = Boosting(trees=60, leaves=6)  # size of the baselines, which read few columns
+
+
+@dataclass(frozen=True)
+class SlipTraining:
+    """Windows for the ``fit`` of an architecture, and the training methods that the task offers."""
+
+    windows: TrainingWindows
+    workspace: Path  # folder for checkpoints, so that training can resume
+
+    def boost(self, params: Boosting) -> Scorer:
+        """Return boosted trees on all features."""
+        return BoostedScorer.fitted(self.windows, params)
+
+    def train_network(self, params: ConvolutionParams) -> Scorer:
+        """Return a network that the shared loop trained."""
+        from tacpipe.tasks.slip.network import ConvolutionScorer
+
+        return ConvolutionScorer.fitted(self.windows, params, self.workspace)
+
+    def apply_rule(self, params: ForecastRule) -> Scorer:
+        """Return the rule on forecasts, which learns nothing."""
+        from tacpipe.tasks.slip.rule import RuleScorer
+
+        return RuleScorer(params.forward_model, params.forward_digest)
+
+
 Fit = Callable[[TrainingWindows, str], Scorer]  # windows and the name of a part of them -> scorer
 
 
@@ -48,9 +75,9 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
         tracks = shuffle_labels(tracks, params.seed)
     windows = read_windows(reader, tracks, params, params.stride)
     _require_both(windows, len(training.recordings), len(tracks))
-    scorer = params.fit(windows, workspace / "scorer")
+    scorer = params.fit(SlipTraining(windows, workspace / "scorer"))
     held_out = labelled_tracks(reader, validation) if validation is not None else []
-    calibration = calibrate_scorer(scorer, lambda part, name: params.fit(part, workspace / name), windows, held_out)
+    calibration = calibrate_scorer(scorer, _fit_params(params, workspace), windows, held_out)
     baselines, levels = {}, {}
     for name, columns in baseline_columns(len(reader.fingers)).items():
         fit = functools.partial(_fit_baseline, columns=columns)
@@ -163,6 +190,10 @@ def out_of_fold(windows: TrainingWindows, fit: Fit) -> Floats:
         scorer = fit(remaining if is_possible else windows, f"fold-{number}")
         scores[fold == number] = score_windows(scorer, windows.select(fold == number))
     return scores
+
+
+def _fit_params(params: SlipModelParams, workspace: Path) -> Fit:
+    return lambda part, name: params.fit(SlipTraining(part, workspace / name))
 
 
 def _fit_baseline(windows: TrainingWindows, name: str, columns: Sequence[int]) -> BoostedScorer:
