@@ -228,7 +228,7 @@ class Compared:
         )
         chosen = max(len(comparison.models) for comparison in comparisons)
         chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""
-        pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
+        pooled = "Runs that differ only in seed or fold are pooled (--each lists them). " if self.pooled else ""
         return (
             f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
             f"jackknife over {clusters} and over seeds where there are several, method and baseline on the same ones."
@@ -248,10 +248,10 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _paths_by_digest(paths))
     if not compared.comparisons:
         raise UsageError(
-            "These results do not hold the errors of single recordings. Run `tacpipe evaluate` again, or give "
+            "These results do not contain errors of single recordings. Run `tacpipe evaluate` again, or give "
             "results of recordings that the model has not seen."
         )
-    reason = "no errors of single recordings that the model has not seen are stored"
+    reason = "there are no stored errors of single recordings that the model has not seen"
     for line in printable.grouped_failures(dict.fromkeys(compared.unused(), reason)):
         terminal.note(f"tacpipe: left out {line}.")
     return compared

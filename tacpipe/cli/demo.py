@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 LEARNING = ("jinja2", "matplotlib", "safetensors", "scipy", "sklearn", "torch", "vl_convert")
 LINKS = ("serial", "websockets")
 NEXT = """Open the page below in a browser. What to try next:
-  tacpipe show {output}/results        the table of a result
-  tacpipe explain {output}/results     where it comes from
-  tacpipe demo -o {output}             a second time: every result is reused
-  docs/tutorials/simulated.md          the same commands, explained"""
+  tacpipe show {output}/results        show the table of a result
+  tacpipe explain {output}/results     show its origin
+  tacpipe demo -o {output}             run it again: every result is reused
+  docs/tutorials/simulated.md          explains these commands"""
 
 
 def run_rig(output: Path, rig_file: Path) -> Path:

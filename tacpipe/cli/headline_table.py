@@ -15,7 +15,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ParamValue
 from tacpipe.store.location import locate
 
-EMPTY = "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
+EMPTY = "All recordings were used for training or contain no window, so there is nothing to evaluate."
 
 
 def of_output(output: Path, file: str) -> list[Headline] | None:

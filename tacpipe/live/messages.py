@@ -138,7 +138,7 @@ def head_values() -> tuple[Value, ...]:
     """Return the first values of every task's messages."""
     return (
         Value("seq", "number of the message, from 1", "integer"),
-        Value("t_ns", "time that the message is about, UTC", "integer", unit="ns"),
+        Value("t_ns", "time of the predicted row, slide or request, UTC", "integer", unit="ns"),
     )
 
 
@@ -166,8 +166,8 @@ def reference_page(declarations: Mapping[str, Declaration]) -> str:
     """Return the Markdown reference page of messages, by task name."""
     lines = [
         "# Live messages\n",
-        "Each message is one JSON object (or the same in msgpack) with `version` 1 and its `kind`. The declarations of the "
-        "tasks give the tables below, the recorded streams and the packets.\n",
+        "Each message is one JSON object (or the same in msgpack) with `version` 1 and its `kind`. The "
+        "tables come from the declarations of the tasks, which also define the recorded streams and the packets.\n",
     ]
     for task, declaration in declarations.items():
         lines += [

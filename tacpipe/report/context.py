@@ -124,7 +124,7 @@ def _result_key(result: Dataset) -> str:
     return json.dumps([config, inputs], sort_keys=True)
 
 
-SIMULATED = "These recordings were simulated: nothing here is evidence about a real sensor."
+SIMULATED = "These recordings were simulated, so the results are not evidence about real sensors."
 
 
 def is_simulated(result: Dataset) -> bool:

@@ -73,7 +73,8 @@ def first_chart(context: Context) -> Chart | None:
     measure = chosen[0].measure
     better = "right" if measure.rises else "left"
     caption = (
-        f"Blue: methods; grey: baselines; dashed: the best baseline. Better is to the {better}. Bars: 95 % intervals."
+        "Blue: methods; grey: baselines; dashed: the best baseline; bars: 95 % intervals. Values further to the "
+        f"{better} are better."
     )
     part = f", {chosen[0].question.part}" if has_panels and chosen[0].question.part else ""
     spec = charts.ranking(dots, measure.scored, level=levels, row=20 if has_panels else 24)

@@ -45,8 +45,8 @@ def metrics_sentence(results: Sequence[Dataset]) -> str:
             return headline.sentence(headlines[0])
     counts = [context.read_json(result, "metrics.json").get("counts") for result in results]
     if all(count is not None and not count.get("recordings", count.get("n", True)) for count in counts):
-        return "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
-    return "These results hold no errors by recording, so methods cannot be compared: their numbers are below."
+        return "All recordings were used for training or contain no window, so there is nothing to evaluate."
+    return "These results contain no errors by recording, so methods cannot be compared. Their numbers are below."
 
 
 def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
@@ -55,7 +55,7 @@ def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
     headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
-    first = [table("Next to its best baseline", *headline.table(headlines))] if headlines else []
+    first = [table("Model and best baseline", *headline.table(headlines))] if headlines else []
     title = f"{f'{place}. ' if count > 1 else ''}{name.replace('_', ' ')}"
     return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
 
@@ -81,13 +81,13 @@ RECORDINGS = 60  # maximum number of rows in a table of recordings
 DOTS = 400  # maximum number of recordings in a chart
 KINDS = {
     "baseline": "Baselines",
-    "variant": "The models' own forecasts in another form",
-    "oracle": "Oracles, which know what they predict",
+    "variant": "Variants of the forecasts",
+    "oracle": "Oracles, which use the true future",
     "control": "Controls",
 }
 PICKED = (
-    "The best of several methods was picked on these very recordings, which flatters it a little; the interval of its gain "
-    "accounts for that."
+    "The best of several methods was selected on these recordings, which biases it slightly upwards. The "
+    "interval of its gain accounts for this."
 )
 
 
@@ -136,12 +136,14 @@ def everything(context: Context) -> list[Fold]:
     measure = context.comparisons[0].measure
     note = blocks.notes(
         headline_caption(measure),
-        "p: that method and best baseline are alike (paired permutation test over the same clusters, seeds as they are), "
-        "not corrected for the number of methods.",
-        "Baselines are those of the runs of one method, because a split has the same for all."
+        (
+            "p: p-value of the hypothesis that method and best baseline are equal (paired permutation test over the "
+            "same clusters, with fixed seeds), not corrected for the number of methods."
+        ),
+        "Baselines come from the runs of one method, because they are the same for all methods of a split."
         if len(context.methods) > 1
         else "",
-        "A number after a name shows how many more methods of its family there are.",
+        "A number after a name is the number of other methods in its family.",
     )
     return fold("All methods and baselines", *tables, note, about=counted(len(context.methods), "methods"))
 
@@ -151,9 +153,9 @@ def headline_caption(measure: Measure) -> str:
     skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
     points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
     return (
-        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 %, over "
-        f"{measure.cluster} (and seeds where there are several), method and baseline on the same ones. They account for the "
-        f"choice of the best among several methods and baselines."
+        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 % intervals "
+        f"over {measure.cluster} (and seeds, if there are several), with method and baseline on the same "
+        f"{measure.cluster}. They account for the choice of the best among several methods and baselines."
     )
 
 
@@ -217,10 +219,13 @@ def recordings(context: Context) -> list[Fold]:
     if not parts:
         return []
     command = SmallPrint(
-        "To see a recording with what was predicted: `tacpipe view DATASET RECORDING --predictions RESULT`, where DATASET "
-        "was given to `tacpipe evaluate` and RESULT is its output. A click on a name copies its command."
+        "To view a recording with its predictions, run `tacpipe view DATASET RECORDING --predictions RESULT`, "
+        "where DATASET was evaluated and RESULT is the output of `tacpipe evaluate`. Click a name to copy its "
+        "command."
     )
-    return [Fold("Recordings", [command, *parts], "where the best method fails, and the command to look at it")]
+    return [
+        Fold("Recordings", [command, *parts], "the worst recordings of the best method, with commands to view them")
+    ]
 
 
 def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
@@ -261,11 +266,11 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
             Chart(f"{title}, better than {row.baseline} on {int((defined > 0).sum())} of {len(defined)}", spec)
         )
     about = f"the {RECORDINGS} worst of {len(names):,}" if len(wrong) > RECORDINGS else "the worst first"
-    right = f"; {len(names) - len(wrong):,} of {len(names):,} are without error" if len(wrong) < len(names) else ""
+    right = f"; {len(names) - len(wrong):,} of {len(names):,} have no error" if len(wrong) < len(names) else ""
     baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
     heads = ["recording", *measure.columns, baseline_head, measure.name]
     if not rows:
-        return [*parts, SmallPrint(f"{title}: all {len(names):,} are without error.")]
+        return [*parts, SmallPrint(f"{title}: none of the {len(names):,} has an error.")]
     return [*parts, blocks.table(f"{title}, {about}{right}", heads, rows)]
 
 
@@ -303,12 +308,8 @@ def basis(context: Context) -> list[Fold]:
     texts = list(context.task.caveats(context))
     texts += [PICKED] if len(context.methods) > 1 else []
     texts += [SIMULATED] if context.simulated else []
-    texts += ["No recording above is one that its model was trained on."] if context.runs else []
-    return (
-        [Fold("What these numbers rest on", [SmallPrint(text) for text in dict.fromkeys(texts) if text])]
-        if texts
-        else []
-    )
+    texts += ["No evaluated recording was used to train its model."] if context.runs else []
+    return [Fold("Basis and limits", [SmallPrint(text) for text in dict.fromkeys(texts) if text])] if texts else []
 
 
 def source(context: Context) -> list[Fold]:

@@ -97,8 +97,8 @@ LATENCIES = {
     "latency_ms": "time from the arrival of the newest used sample to publishing",
     "age_ms": "time from the arrival of the newest sample of the master stream to publishing",
     "compute_ms": "part of the latency spent on decoding and the model",
-    "cause": "flags: why there is no answer, or which input was missing; 0: none",
-    "skipped": "answers skipped so far because of overload",
+    "cause": "flags: reason why there is no prediction, or the missing input; 0: none",
+    "skipped": "number of predictions skipped so far because of overload",
     "late": "samples so far that arrived too late to be used",
 }  # meaning of the columns of the stream `LATENCY`
 

@@ -71,7 +71,7 @@ DECLARATION = Declaration(
             quantity="prediction",
             columns=_quantile_columns,
         ),
-        Value("cause", "reason why there is no forecast, or what it was made without", "string"),
+        Value("cause", "reason why there is no forecast, or the missing input", "string"),
         Value("alarms", "`state` (on, off or unknown) and `score` of each alarm", "object", attribute="alarms_by_name"),
         Value(
             "alarm_states",
@@ -101,7 +101,7 @@ class ForecastMessage(messages.Message):
     seq: int
     t_ns: int  # time of the grid point, UTC as the recording has it
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
-    cause: str = ""  # reason why there is no forecast, or what it was made without
+    cause: str = ""  # reason why there is no forecast, or the missing input
     flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
     alarms: Mapping[str, State] = field(default_factory=lambda: dict(NOTHING_KNOWN))
     made_from_t_ns: int = 0  # arrival of the newest sample that was read

@@ -136,21 +136,27 @@ class ForwardReport(TaskReport):
             f"{name} {', '.join(map(str, sorted(setting_values, key=str)))}" for name, setting_values in values.items()
         )
         counts = [run.metrics.fresh.counts for run in runs[:1]]
-        mixed = "Objects of some recordings are known to one run and unseen to another."
+        mixed = "For some recordings, the object is known to one run and unseen by another."
         effective = [
-            f"{setting_values['windows']:,} windows overlap and are worth about {setting_values['effective_windows']:,}"
+            (
+                f"{setting_values['windows']:,} overlapping windows are equivalent to about "
+                f"{setting_values['effective_windows']:,}"
+            )
             for setting_values in counts
         ]
         return [
             f"Settings: {settings}." if settings else "",
             *_look_ahead_notes(context),
-            "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
-            "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before "
-            "it is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
+            (
+"Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all "
+"channels, as the geometric mean of the ratios over recordings. All predictions are decoded to the "
+"unit of the channels before the evaluation, so all rows can be compared. Errors without a step are "
+"means over all steps."),
             f"In the first run, {effective[0]}." if effective else "",
             mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
-            "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it "
-            "perfectly."
+            (
+"The plan is the recorded motion, so errors of methods that read it are valid for an arm that "
+"follows its plan perfectly.")
             if any(run.actions == "planned" for run in runs)
             else "",
             "; ".join(f"{figures.predictor_title(name)}: {figures.EXPLAINED[name]}" for name in _predictors(context)) + ".",
@@ -198,7 +204,7 @@ def _skill_ahead_charts(context: Context) -> list[Fold]:
             mean, low, high = (getattr(interval, name)[:-1] for name in ("mean", "low", "high"))
             lines.append(Curve(row.name, x, mean, low, high, dashed=row.kind != "model"))
             cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
-        caption = "Bands: 95 % intervals over recordings. Dashed: a baseline. Click a name to show it alone."
+        caption = "Bands: 95 % intervals over recordings. Dashed: a baseline. Click a name to show only this method."
         caption += f" Ends at {blocks.signed(FLOOR, 1)}, above some of {blocks.listed(cut)}." if cut else ""
         spec = charts.lines(
             lines, f"time ahead ({'ms' if rate_hz else 'steps'})", "skill over persistence", order=order,
@@ -254,7 +260,7 @@ def _channels(context: Context) -> list[Fold]:
             *(f"skill {step}" for step in ahead),
         ]
         tables += [table(comparison.question.where, heads, rows)] if rows else []
-    note = SmallPrint("Skill is over persistence here.")
+    note = SmallPrint("Here, skill is relative to persistence.")
     return fold("By sensor and axis", *tables, note)
 
 
@@ -263,10 +269,8 @@ def _ablations(context: Context) -> list[Fold]:
     steps = _steps(context)
     parts = list(dict.fromkeys(_known_objects(comparison.question) for comparison in context.comparisons))
     tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
-    note = SmallPrint(
-        "Differences are paired: both are on the same recordings. An interval above 0 shows that the plan helps."
-    )
-    return fold("What the plan and the timeline change", *tables, note)
+    note = SmallPrint("Differences are paired by recording. An interval above 0 shows that the plan is useful.")
+    return fold("Effects of the plan and the timeline", *tables, note)
 
 
 def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
@@ -293,7 +297,7 @@ def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None
     for part in parts:
         place = headline.PARTS[part] or "all recordings"
         heads += [f"{place}: mean skill", f"{place}: the plan's gain", f"{place}: the plan's gain at t+{steps[-1]}"]
-    return [table("What the planned motion is worth", [*heads, "runs"], rows)] if rows else []
+    return [table("Value of the planned motion", [*heads, "runs"], rows)] if rows else []
 
 
 def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
@@ -317,7 +321,7 @@ def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | No
     for part in parts:
         place = headline.PARTS[part] or "all recordings"
         heads += [f"{place}: mean skill", f"{place}: MAE t+{steps[-1]} ({unit})"]
-    title = "Timelines: a step lasts differently, so rows cannot be compared"
+    title = "Timelines: steps have different durations, so rows cannot be compared"
     return [table(title, [*heads, "runs"], rows)] if rows else []
 
 

@@ -41,10 +41,8 @@ def anticipation_folds(context: Context) -> list[Fold]:
         [name, f"{scores['events']:,.0f}", number(100 * scores["recall"]), *(number(scores[key]) for key in measures)]
         for name, scores in sorted(described, key=lambda pair: -pair[1]["recall"])
     ]
-    heads = ["", "events", "seen coming (%)", "median lead (rows)", "median lead (frames)", "false alarms a minute"]
-    return (
-        fold("Anticipation", table("Changes that a forecast announces before they come", heads, rows)) if rows else []
-    )
+    heads = ["", "events", "seen coming (%)", "median lead (rows)", "median lead (frames)", "false alarms per minute"]
+    return fold("Anticipation", table("Changes of load that a forecast predicted", heads, rows)) if rows else []
 
 
 def anticipation_scores(method: Method, predictor: str) -> dict[str, float] | None:
@@ -61,19 +59,19 @@ def anticipation_scores(method: Method, predictor: str) -> dict[str, float] | No
     return scores
 
 
-SLIP_TITLE = "Slips that an alarm led, its level set on other recordings"
-SLIP_HEADS = {  # by name of what the alarm was worth
+SLIP_TITLE = "Slips preceded by an alarm, with thresholds from other recordings"
+SLIP_HEADS = {  # by name of the measure
     "events": "slips",
-    "led": "led",
-    "led_percent": "led (%)",
+    "led": "preceded",
+    "led_percent": "preceded (%)",
     "median_lead_ms": "median lead (ms)",
     "false_alarms": "false alarms",
     "minutes": "minutes without slips",
-    "false_alarms_per_hour": "false alarms an hour",
+    "false_alarms_per_hour": "false alarms per hour",
 }
 SLIP_NOTE = (
-    "Slips of one recording are alike, and results do not state the recording of each, so these are counts without an "
-    "interval."
+    "Slips of one recording are not independent, and the results do not state the recording of each slip, so "
+    "these are counts without an interval."
 )
 
 
@@ -148,9 +146,9 @@ def _live_tables(run: ComparedRun, live: LiveMetrics) -> list[Table]:
     rows, latency = live["rows"], live["latency"]
     counted: list[Cells] = [
         ["published forecasts", f"{rows['published']:,}"],
-        ["of these equal bit for bit to predict --causal", f"{rows['equal']:,} of {rows['compared']:,}"],
-        ["others that follow samples that came too late", f"{rows['differ_after_late_samples']:,}"],
-        ["rows skipped under overload", f"{rows['skipped']:,}"],
+        ["of these, bit-identical to predict --causal", f"{rows['equal']:,} of {rows['compared']:,}"],
+        ["others, after samples that arrived too late", f"{rows['differ_after_late_samples']:,}"],
+        ["rows skipped because of overload", f"{rows['skipped']:,}"],
     ]
     counted += [[f"latency, {name}", number(latency[key])] for name, key in _LATENCY if key in latency]
     alarms: list[Cells] = [
@@ -166,7 +164,7 @@ def _live_tables(run: ComparedRun, live: LiveMetrics) -> list[Table]:
     tables = [table("Live sessions: mean absolute error", ["", *heads], errors)] if errors else []
     tables.append(table("Live sessions: rows and latency", ["", ""], counted))
     if alarms:
-        names = ["alarm, event", "", "events", "led", "median lead (ms)", "false alarms an hour"]
+        names = ["alarm, event", "", "events", "led", "median lead (ms)", "false alarms per hour"]
         tables.append(table("Live sessions: alarms", names, alarms))
     return tables
 

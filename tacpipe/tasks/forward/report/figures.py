@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
 EXPLAINED = {
     "model": "the trained model",
-    "persistence": "nothing changes: the last frame is held",
-    "codec_persistence": "the last frame is held after going through the codec",
-    "codec": "the true future through the codec, which is what compression alone costs",
-    "model_anchored": "the model's forecast, moved so that it continues from the last frame",
-    "codec_anchored": "the true future through the codec, moved so that it continues from the last frame",
-    "context_mean": "the mean of the frames the model reads",
+    "persistence": "no change: the last frame is repeated",
+    "codec_persistence": "the last frame, encoded and decoded, is repeated",
+    "codec": "the true future, encoded and decoded: the cost of the compression",
+    "model_anchored": "the forecast of the model, shifted to continue from the last frame",
+    "codec_anchored": "the true future, encoded and decoded, shifted to continue from the last frame",
+    "context_mean": "the mean of the frames that the model reads",
     "train_mean": "the mean of the training recordings",
-    "damped_trend": "the last frames' trend continues and fades",
-    "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
-    "ridge": "ridge regression of the changes to come on those of the frames the model reads",
+    "damped_trend": "a decaying continuation of the last trend",
+    "last_value_linear": "a linear map of the frames that the model reads, relative to the last frame",
+    "ridge": "ridge regression of the future changes on the changes in the frames that the model reads",
     "ridge_actions": "the same with the planned motion",
 }
 
@@ -135,11 +135,7 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
             rows.append(
                 [f"{objects}, skill", *(_error_cell(_single_ratio_skill(part).get(step, {})) for step in steps)]
             )
-    return (
-        [*tables, table("Known objects and unseen ones: mean absolute error, and skill", heads, rows)]
-        if rows
-        else tables
-    )
+    return [*tables, table("Known and unseen objects: mean absolute error, and skill", heads, rows)] if rows else tables
 
 
 def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
@@ -154,8 +150,9 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
         return ""
     steps_text = "at every step" if lost == steps else f"up to t+{max(lost)}"
     return (
-        f"The codec alone loses more than persistence errs {steps_text} (squared error of the true future through the "
-        f"codec: {number(floor['mean']).text} {unit}² on average), so a model of its latents can hardly win there in {unit}."
+        f"The error of the codec is larger than the error of persistence {steps_text} (mean squared error of the "
+        f"true future, encoded and decoded: {number(floor['mean']).text} {unit}²), so a model of its latents can "
+        f"hardly be better than persistence there, in {unit}."
     )
 
 
@@ -167,7 +164,7 @@ def _describe_seen(metrics: ForwardMetrics) -> str:
         return ""
     count = counted(seen.counts["recordings"], "recordings")
     mean = blocks.signed(described["mean"])
-    return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
+    return f"Left out: {count} that were used for training or early stopping, with a mean skill of {mean}."
 
 
 def _single_ratio_skill(part: ForwardScores) -> IntervalsByStep:
@@ -197,8 +194,9 @@ def _ordered_predictors(scores: ForwardScores) -> list[str]:
 SHOWN_S = 12.0  # seconds of a recording that are drawn
 TRUTH = "truth now"
 UNSHIFTED = (
-    "Each prediction stands at the time at which it was known: one that sees ahead runs left of the truth, "
-    "persistence lies on it. Long recordings are drawn from their first seconds, thinned to what can be seen."
+    "Each prediction is drawn at the time at which it was made, so a prediction that looks ahead is left of the "
+    "truth, and persistence coincides with it. Only the first seconds of long recordings are drawn, at a reduced "
+    "resolution."
 )
 
 
@@ -229,7 +227,7 @@ def draw_traces(
         lines = [Curve(TRUTH, time_s, values(latent))]
         lines += [Curve(f"t+{step}", time_s, values(f"{latent}_t{step}"), dashed=True) for step in ahead]
         quantity = f"{latent} ({unit})" if unit else latent
-        spec = charts.lines(lines, "time at which the prediction is known (s)", quantity, points=False, height=170)
+        spec = charts.lines(lines, "time at which the prediction is made (s)", quantity, points=False, height=170)
         drawn.append(Chart(f"{title}: {latent}", spec, caption, wide=True))
     return drawn
 
@@ -279,7 +277,7 @@ def prediction_folds(context: Context) -> list[Fold]:
                 run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption, unit=_unit_of_run(run)
             )
     return fold(
-        "Predictions next to the truth", *drawn, *_paper_traces(context), SmallPrint(UNSHIFTED) if drawn else None
+        "Predictions and measurements", *drawn, *_paper_traces(context), SmallPrint(UNSHIFTED) if drawn else None
     )
 
 

@@ -91,9 +91,10 @@ PRINTED = {  # validation and test error in Table 1 of the paper
     "PCA": (0.0298, 0.0363),
 }
 OWN_SPACE = (
-    "Each row is in its own representation's space, scaled to ±1 on the training recordings. Rows of different spaces "
-    "cannot be compared: a space that leaves out what is hard to predict has the lower error. Persistence in the same space "
-    "shows what a row is worth: below 1 in the column next to it, the model is better."
+    "Each row is in the space of its representation, scaled to ±1 on the training recordings. Rows of different "
+    "spaces cannot be compared: a space without the components that are hard to predict has lower errors. "
+    "Compare each row with persistence in the same space: if the ratio in the next column is below 1, the model "
+    "is better."
 )
 
 
@@ -115,7 +116,7 @@ def representation_folds(context: Context) -> list[Fold]:
     )
     method_table = _representation_table(context) if context.runs else None
     note = OWN_SPACE + (
-        " The paper's own recordings are not public; its numbers are as printed." if context.published else ""
+        "The recordings of the paper are not public; its numbers are quoted as printed." if context.published else ""
     )
     return fold(
         "Representations", method_table, SmallPrint(note) if method_table else None, *_codec_charts(codecs, published)
@@ -200,7 +201,7 @@ def _representation_table(context: Context) -> Table | None:
     title = (
         "Table 1 in the paper's form: mean squared error"
         if published
-        else "Mean squared error in each representation's own space"
+        else "Mean squared error in the space of each representation"
     )
     return table(f"{title}, mean ± sd over runs", heads, rows)
 
@@ -212,8 +213,8 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
     pca, autoencoder = paper_codec(codecs, "PCA", 20), paper_codec(codecs, "AE-C1", 8)
     if pca and pca.get("explained_ratio"):
         kept_latents, ratio = int(pca["latents"]), pca["explained_ratio"]
-        printed = "; in the paper 20 hold 82 %" if published else ""
-        caption = f"The {kept_latents} that are kept hold {100 * sum(ratio[:kept_latents]):.1f} %{printed}."
+        printed = "; in the paper, 20 explain 82 %" if published else ""
+        caption = f"The {kept_latents} latents explain {100 * sum(ratio[:kept_latents]):.1f} %{printed}."
         values = {str(place): 100 * float(share) for place, share in enumerate(ratio[:COMPONENTS], 1)}
         title = f"Variance by principal component{', Figure 4 of the paper' if published else ''}"
         drawn.append(
@@ -234,7 +235,7 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
             Curve(name, sorted(by_width), [by_width[width] for width in sorted(by_width)])
             for name, by_width in sorted(series.items())
         ]
-        caption = "Error of encoding and decoding, where 1 is what no latent at all would give. Lower is better."
+        caption = "Error of encoding and decoding, relative to a codec without latents (1). Lower is better."
         spec = charts.lines(lines, "latents", "mean squared error (standardised)")
         drawn.append(Chart("Reconstruction error by number of latents", spec, caption))
     rows = [
@@ -249,5 +250,5 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
         for share in losses
     ]
     heads = ["", "latents", "MSE (standardised)", "MAE (channels' unit)", "training recordings", "codecs"]
-    lost = [table("What representations lose on the way to latents and back", heads, rows)] if rows else []
+    lost = [table("Reconstruction errors of the representations", heads, rows)] if rows else []
     return [*([Charts(drawn)] if drawn else []), *lost]

@@ -88,12 +88,13 @@ def skill_cell(intervals: Interval | None, at: int) -> Cell:
 
 
 SITUATION_NOTE = (
-    "A window is named by its last row and the rows to come, the first name that fits: no contact; closing: the gripper "
-    f"closes by more than {1000 * WIDTH_M:g} mm or contact begins; releasing: it opens by more than that or contact ends; "
-    f"slipping: the load falls by more than {100 * LOST:g} % with the gripper still; holding in motion: the hand is faster "
-    f"than {PACE_M_S:g} m/s or {TURNING_RAD_S:g} rad/s; holding still. Errors are means over all steps and channels, "
-    "skill is 1 − mean absolute error / that of persistence, the geometric mean over recordings. The interval is over "
-    "recordings, given for methods of one run."
+    "The situation of a window follows from its last row and the future rows, by the first rule that applies: no "
+    f"contact; closing: the gripper closes by more than {1000 * WIDTH_M:g} mm or contact begins; releasing: it "
+    f"opens by more than that or contact ends; slipping: the load falls by more than {100 * LOST:g} % while the "
+    f"gripper is still; holding in motion: the hand is faster than {PACE_M_S:g} m/s or {TURNING_RAD_S:g} rad/s; "
+    "holding still. Errors are means over all steps and channels. Skill is 1 − mean absolute error / that of "
+    "persistence, as the geometric mean over recordings. Intervals are over recordings, for methods with a "
+    "single run."
 )
 
 
@@ -111,7 +112,7 @@ def situation_folds(context: Context) -> list[Fold]:
     heads = ["situation", "method", "windows", "of persistence's error", "MAE of persistence", "MAE", "skill"]
     if not rows:
         return []
-    return fold("By situation", table("Errors by what the hand does", heads, rows), SmallPrint(SITUATION_NOTE))
+    return fold("By situation", table("Errors by situation", heads, rows), SmallPrint(SITUATION_NOTE))
 
 
 def skill_in_situation(method: Method, situation: str) -> dict[str, float] | None:
@@ -147,13 +148,13 @@ def skill_in_situation(method: Method, situation: str) -> dict[str, float] | Non
 EXAMPLES = "bands.json"
 NAMES = {
     "model": "quantiles of the model",
-    "model_unconditional": "model, one band for all moments",
+    "model_unconditional": "model, one band for all windows",
     "persistence": "persistence, quantiles of its errors",
 }
 SHOWN = (1, 5, 10)  # steps of the table
 EXPLAINED = (
-    "A band holds as often as it states if its coverage lies on the dashed line; shaded: 95 % over recordings. The "
-    "narrowest band of the right coverage is best, which the pinball loss measures (lower is better)."
+    "A band has its nominal coverage if it is on the dashed line; shaded: 95 % intervals over recordings. The "
+    "narrowest band with the correct coverage is best, as measured by the pinball loss (lower is better)."
 )
 
 

@@ -130,15 +130,17 @@ def _describe_pooling(methods: Sequence[Method]) -> str:
     published = all(method.published for method in methods)
     predicted = {name for run in runs for name in run.predictions.predicted}
     sentences = [
-        "Slides named right: accuracy ± standard deviation over runs; in small print, those of all that runs of the method "
-        "were evaluated on, then the 95 % interval (Wilson) over slides, each counted once however many runs named it.",
-        "Networks have the weights that did best in validation, unless the name states otherwise."
+        (
+            "Correctly classified slides: accuracy ± standard deviation over runs; in small print, accuracy over all "
+            "slides of all runs of the method, then the 95 % interval (Wilson) over slides, each counted once."
+        ),
+        "Networks have the weights with the best validation accuracy, unless the name states otherwise."
         if any(run.history for run in runs)
         else "",
         f"Last epoch: the weights of the last one{', which the paper’s code reports' if published else ''}."
         if LAST in predicted
         else "",
-        "Skill is 1 − errors / errors of the mean level alone, a linear readout of the time-averaged channels."
+        "Skill is 1 − errors / errors of the mean level, a linear readout of the time-averaged channels."
         if LEVEL in predicted
         else "",
         "Mapping to a known space is reported for the sensor that was mapped to the other's."

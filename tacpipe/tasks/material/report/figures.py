@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 MAX_PAIRS = 3  # maximum number of pairs of materials in a sentence
 CONFUSION_NOTE = (
-    "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
+    "Unseen slides. Blue: correct; orange: wrong. The intensity is the fraction of the slides of a material."
 )
 
 
@@ -79,7 +79,7 @@ def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
         row, column = np.unravel_index(index, wrong.shape)
         if wrong[row, column]:
             phrases.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
-    return f"Most often it takes {listed(phrases)}." if phrases else "It takes none for another."
+    return f"Most often it takes {listed(phrases)}." if phrases else "It confuses no materials."
 
 
 def _confusion_chart(method: Method, sensor: str) -> Chart:
@@ -143,7 +143,10 @@ def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
     )
     caption = ""
     if any(scores.is_control(method) for method in shown_methods):
-        caption = "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
+        caption = (
+            "If the alignment is driven only by labels, the latent difference of permuted pairs decreases as for "
+            "real pairs."
+        )
     return [Chart(title, spec, caption)]
 
 
@@ -185,9 +188,11 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
             spec = charts.lines(lines, "training slides", "accuracy (%)", level=("chance", chance))
             caption = "Unseen slides, with 95 % intervals; dashed across: chance."
             if any("other sensor whole" in name for name in drawn_points):
-                caption += " Other sensor whole: this one alone has fewer."
+                caption += "The other sensor has all of its slides."
             if any("fixed batches" in name for name in drawn_points):
-                caption += " Fixed batches: the same in every epoch, of which a sensor learns from a share."
+                caption += (
+                    "Fixed batches: the batches are the same in every epoch, and a sensor learns from a part of them."
+                )
             figures.append(Chart(f"Accuracy on {sensor_title(sensor)} by number of training slides", spec, caption))
     return blocks.fold("Few slides", Charts(figures)) if figures else []
 

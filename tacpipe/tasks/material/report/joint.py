@@ -52,8 +52,9 @@ REDUCED: Mapping[str, Mapping[int, tuple[float, float, float]]] = {
     },
 }
 PRINTED_BASIS = (
-    "The paper's numbers stand as printed. Nearly all are whole numbers of 192 slides, so one of its runs is uncertain by "
-    "about 3 points (two standard errors) at 95 %; those of its reduced sets rest on single runs."
+    "The numbers of the paper are quoted as printed. Nearly all are whole numbers of 192 slides, so one of its "
+    "runs has an uncertainty of about 3 points (two standard errors) at 95 %. The numbers for its reduced sets "
+    "come from single runs."
 )
 
 
@@ -61,7 +62,7 @@ MAX_DISTANCE_RATIO = 2.0  # latents of permuted pairs count as equally close as 
 MAX_SWAP_LOSS = 0.2  # loss of accuracy with exchanged classifiers above which sensors are not aligned
 MAX_EXTRA_SWAP_LOSS = 0.05  # additional loss of accuracy with exchanged classifiers compared with real pairs
 NO_CONTROL = (
-    "No run with permuted materials is among the results, so whether labels alone drive the alignment was not tested."
+    "The results contain no run with permuted materials, so it was not tested whether only labels drive the alignment."
 )
 
 
@@ -85,7 +86,10 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
     alignments = [_last_alignment(item) for item in (joint, permuted)]
     swaps = [_swapped_accuracy(item) for item in (joint, permuted)]
     if any(math.isnan(item) for item in alignments) or not swaps[0] or set(swaps[0]) - set(swaps[1]):
-        return "A run with permuted materials is there, but no latent difference or exchanged classifier to evaluate it by."
+        return (
+            "The run with permuted materials has neither a latent difference nor exchanged classifiers, so it cannot "
+            "be evaluated."
+        )
     costs = [
         {
             name: counted.fraction - swaps[at][name].fraction
@@ -96,8 +100,9 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
     ]
     if max(costs[0].values()) > MAX_SWAP_LOSS:
         return (
-            f"Even real pairs have not aligned: exchanged classifiers name {100 * max(costs[0].values()):.1f} points "
-            f"fewer slides right than the sensors' own, so the control has nothing to be compared with."
+            "Even real pairs are not aligned: with exchanged classifiers, the accuracy is "
+            f"{100 * max(costs[0].values()):.1f} points lower than with the sensors' own, so there is nothing to "
+            "compare the control with."
         )
     aligns = alignments[1] <= MAX_DISTANCE_RATIO * alignments[0]
     works = all(costs[1][sensor] - costs[0][sensor] <= MAX_EXTRA_SWAP_LOSS for sensor in costs[0])
@@ -111,8 +116,9 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
     )
     if aligns and works:
         return (
-            f"The alignment is label-driven: pairs of permuted materials align as well, and exchanging classifiers costs "
-            f"about as little ({numbers}), so neither shows that the sensors share anything but labels."
+            "The alignment is driven by labels: pairs of permuted materials align as well, and exchanged "
+            f"classifiers lose about as little accuracy ({numbers}), so neither shows that the sensors have more "
+            "in common than labels."
         )
     half = "align as well but do not swap as well" if aligns else "swap as well but do not align as well"
     verdict = half if aligns or works else "neither align nor swap as well"
@@ -122,7 +128,7 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
 def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
     """Return the gain of joint learning, one sentence per sensor."""
     if independent is None:
-        return ["No independently trained RAEC is among the results, so what joint learning does was not tested."]
+        return ["The results contain no independently trained RAEC, so the effect of joint learning was not tested."]
     sentences = []
     for sensor in sensors_of([joint]):
         difference = scores.compare_runs(joint, independent, sensor)
@@ -311,10 +317,10 @@ def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
 
 
 ZERO_SHOT_NOTE = (
-    "The sensor's own labels and pairs of these materials were excluded from training; the other sensor's classifier "
-    "predicts them from its latents, among all materials or only among the held-out ones. Only an accuracy above "
-    "chance here is evidence of common information of the sensors. Slides of one material are not independent, so "
-    "the interval counts held-out materials, and neither slides nor runs. "
+    "The labels and pairs of these materials were excluded from training for this sensor. The classifier of the "
+    "other sensor predicts them from the latents, among all materials or only among the held-out ones. Only an "
+    "accuracy above chance is evidence of information that the sensors have in common. Slides of one material "
+    "are not independent, so the interval is over held-out materials, not over slides or runs. "
 )
 
 
@@ -350,7 +356,7 @@ def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
     heads = ["", "slides of", "accuracy (%)", "chance (%)", "runs"]
     table = blocks.table("Zero shot: accuracy on held-out materials", heads, rows)
     return blocks.fold(
-        "Materials that one sensor never saw",
+        "Materials that one sensor was not trained on",
         table,
         SmallPrint(ZERO_SHOT_NOTE),
         *map(SmallPrint, zero_shot_sentences(methods)),

@@ -25,19 +25,20 @@ UNKNOWN = "unknown"  # answer for a slide that resembles no learned material
 MIN_BIN_COUNT = 20  # minimum number of answers per bin of predicted probability
 RATES = np.linspace(0, 1, 101)  # false-unknown rates at which curves are averaged over runs
 RELIABLE = (
-    "Accuracy against predicted probability, in bins with equal numbers of slides; on the thin line probabilities "
-    "are frequencies. As trained: in bins of equal width. Shaded: 95 % (Wilson) over slides, each counted once."
+    "Accuracy against predicted probability, in bins with equal numbers of slides. On the thin line, "
+    "probabilities equal frequencies. Before calibration: bins of equal width. Shaded: 95 % intervals (Wilson) "
+    "over slides, each counted once."
 )
 TABLE = (
-    "False unknown: slides of known materials answered unknown. False known: slides of left-out materials assigned "
-    "to a class. Right: accuracy among the assigned slides of known materials. 95 % intervals are Wilson's over "
-    "slides, each counted once, and for false known over materials, if there are six or more; calibration error, log "
-    "loss and AUROC are means over runs."
+    "False unknown: slides of known materials classified as unknown. False known: slides of left-out materials "
+    "assigned to a class. Right: accuracy among the assigned slides of known materials. 95 % intervals are "
+    "Wilson's over slides, each counted once, and for false known over materials, if there are six or more. "
+    "Calibration error, log loss and AUROC are means over runs."
 )
 REFUSED = (
-    "Each threshold answers some slides of known materials with unknown, and some of materials that were left out of "
-    "training. On the thin line the score distinguishes nothing. Diamonds: the threshold that calibration set without "
-    "a slide of an unknown material. Shaded: from the lowest to the highest run."
+    "Each threshold classifies some slides of known materials and some slides of left-out materials as unknown. "
+    "On the thin line, the score has no information. Diamonds: the threshold that calibration set without slides "
+    "of unknown materials. Shaded: from the lowest to the highest run."
 )
 
 
@@ -185,7 +186,10 @@ def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]])
             100 * rate_of(answers[answers.known == flag], "refused").fraction for flag in (True, False)
         )
         points.append((name, lost, unknown_rate))
-    x, y = "slides of known materials answered unknown (%)", "slides of unknown materials answered unknown (%)"
+    x, y = (
+        "slides of known materials classified as unknown (%)",
+        "slides of unknown materials classified as unknown (%)",
+    )
     spec = charts.lines(lines, x, y, diagonal=(0, 100), points=False, height=260)
     spec["layer"].append(charts.marked(points, x, y))
     return Chart(f"Unknown: {sensor}", spec)

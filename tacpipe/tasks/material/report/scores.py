@@ -180,8 +180,8 @@ def nearest_method(method: Method, candidates: Sequence[Method]) -> Method | Non
 
 
 SESSIONS = (
-    "Each material was recorded in one session, so texture cannot be distinguished from session in these data: a model that "
-    "recognises a session by its drift or its mean level is right as well."
+    "Each material was recorded in one session, so these data cannot separate texture from session: a model that "
+    "recognises a session by its drift or its mean level is also correct."
 )
 
 

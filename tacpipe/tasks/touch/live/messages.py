@@ -41,7 +41,7 @@ DECLARATION = Declaration(
         ),
         Value(
             "best_grasp",
-            "best grasp, its score and levels, and how many grasps there are",
+            "best grasp, its score and levels, and the number of grasps",
             streams=(LSL,),
             columns=lambda sizes: _names("best", *SCORES, "grasps"),
         ),
@@ -55,7 +55,7 @@ DECLARATION = Declaration(
         ),
         Value(
             "grasp_scores",
-            "score of the grasp and how much each finger is touched, 0 to 1",
+            "score of the grasp, and level of each finger, 0 to 1",
             streams=(TOUCH,),
             quantity="prediction",
             columns=lambda sizes: _names(*SCORES),

@@ -145,10 +145,10 @@ class TouchReport(TaskReport):
 
 
 POOLED = (
-    "PDC is the fluid pressure in a fingertip. RMSE is pooled over all grasps, electrodes and runs of a method, as a "
-    "fraction of the target's fixed range and in device counts; batch mean is the mean RMSE of batches of 10. R² is "
-    "relative to the mean of the evaluated grasps, so a constant has 0 or less. A novel object has no mean of its "
-    "own: the constant represents it."
+    "PDC is the fluid pressure in a fingertip. RMSE is pooled over all grasps, electrodes and runs of a method, "
+    "as a fraction of the fixed range of the target and in device counts. Batch mean is the mean RMSE of batches "
+    "of 10. R² is relative to the mean of the evaluated grasps, so it is at most 0 for a constant. A novel "
+    "object has no object mean; the constant replaces it."
 )
 NO_EVIDENCE = "there is no evidence of generalisation"
-MIXED = "What is marked simulated is not evidence about a real sensor."
+MIXED = "Results marked as simulated are not evidence about real sensors."

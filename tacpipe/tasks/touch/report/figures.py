@@ -76,12 +76,12 @@ def _pressure_chart(method: Method, target: str) -> Chart:
 FINGERS = ("e_th", "e_mf")
 PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # title -> quantile of the error
 FINGERTIPS = (
-    "Fingertips are seen from the pad, with the skin unrolled and the tip up. R² is relative to the mean of these "
-    "grasps: 1 is perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact covers few electrodes: a "
-    "mean over 24 hides them."
+    "Fingertips are seen from the pad, with the skin unrolled and the tip at the top. R² is relative to the mean "
+    "of these grasps: 1 is perfect (blue), 0 is as good as the mean, and values below 0 are worse (orange). A "
+    "contact covers few electrodes, so a mean over 24 would hide them."
 )
 COLOURS = (
-    "Counts. Blue: lower than the constant, which is the mean of training grasps, so pressed more; orange: higher."
+    "Counts. Blue: lower than the constant (the mean of training grasps), which means more pressure; orange: higher."
 )
 
 
@@ -195,8 +195,8 @@ NEAR_MM = 10.0  # distance to a contact point that is highlighted; a fingertip h
 POINTS = 700  # number of drawn points per cloud
 VIEWS = {"from the camera": 0, "from the side": 2}  # view -> index of the horizontal axis; y is vertical
 CLOUD_COLOURS = (
-    "Blue points are near the first contact, orange ones near the second. The cloud contains only what the camera "
-    "saw, though a finger may touch other parts."
+    "Blue points are near the first contact, orange points near the second. The cloud contains only the visible "
+    "side, although a finger may touch other parts."
 )
 
 
@@ -253,9 +253,7 @@ def _cloud_chart(shard: Recording, words: str) -> Chart:
 
 
 ALL = "all"  # name of a network that predicts all targets
-UNWATCHED = (
-    " Where no grasps were kept for validation, it is the loss on those of training, evaluated after each epoch."
-)
+UNWATCHED = "If there are no validation grasps, it is the loss on the training grasps after each epoch."
 
 
 def loss_charts(methods: Sequence[Method]) -> list[Chart]:

@@ -196,8 +196,8 @@ BASELINES = {  # rows of every table
     NEAREST_IN_TIME: "mean of the nearest in time",
 }
 RECORDED = (
-    "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects also depend "
-    "on the time of recording: the mean of the grasps nearest in time, of any object, shows how much."
+    "{same} of {all} evaluated grasps follow a grasp of the same object in time, so errors on known objects also "
+    "depend on the time of recording. The mean of the grasps nearest in time, of any object, shows the extent."
 )
 MAX_IN_A_ROW = 0.75  # fraction of successive grasps of the same object above which objects were not interleaved
 

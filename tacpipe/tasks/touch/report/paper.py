@@ -71,14 +71,15 @@ TEST_AND_NOVEL: Mapping[str, Final] = {  # Figures 10 and 11
     "e_mf": Final(0.05922, 195, 0.10317, 340, 74),
 }
 TRAINED_ON = (
-    "The paper's columns are of RGBPose, trained on 9,000 grasps of its 12 objects (12,000 for novel ones). Ours are "
-    "for the inputs and training grasps of these runs, and the error of a constant differs between the two sets."
+    "The columns of the paper are for RGBPose, trained on 9,000 grasps of its 12 objects (12,000 for novel "
+    "ones). Ours are for the inputs and training grasps of these runs. The error of a constant differs between "
+    "the two sets."
 )
 SCALES = (
-    "The paper's RMSE of one network on the thumb's pressure is 0.01141 in cross-validation (Tables III and IV) and "
-    "0.05496 in testing (Figure 10), which cannot be on one scale: as a fraction of the largest reading, 3,400 "
-    "counts, the former is 39 counts, as a fraction of the range of 900 it is 10, and the latter is 49. Tables I to "
-    "IV stand as printed; our errors are fractions of the range."
+    "In the paper, the RMSE of one network on the pressure of the thumb is 0.01141 in cross-validation (Tables "
+    "III and IV) and 0.05496 in testing (Figure 10), which cannot be on the same scale. As a fraction of the "
+    "largest reading, 3,400 counts, the former is 39 counts; as a fraction of the range of 900, it is 10, and "
+    "the latter is 49. Tables I to IV are quoted as printed. Our errors are fractions of the range."
 )
 
 
@@ -197,7 +198,7 @@ FORMS = (
     ),
     Form(
         "Figure 9",
-        "what the network is given",
+        "inputs of the network",
         "inputs",
         {
             "xyz": "XYZ",
@@ -227,13 +228,14 @@ FORMS = (
     ),
 )
 ORDER = (
-    "The paper prints no numbers of Figure 9: it ranks pose before contacts before the cloud alone, finds colour worse than "
-    "none but for RGBPose, and chooses that (0.01859 without normalisation)."
+    "The paper gives no numbers for Figure 9. It ranks pose before contacts before the cloud without either, "
+    "finds that colour is worse than no colour except for RGBPose, and chooses RGBPose (0.01859 without "
+    "normalisation)."
 )
 
 ESTIMATED = (
-    "The wrist rotation was not recorded: if it is an input here, it is estimated from the two contacts and the line "
-    "of sight, and adds no information to them."
+    "The wrist rotation was not recorded. If it is an input here, it is estimated from the two contacts and the "
+    "line of sight, and adds no information."
 )
 
 
@@ -316,10 +318,10 @@ def _setting_chart(form: Form, scores: Mapping[object, Score | None], baselines:
         for sd in [0.0 if math.isnan(scored.each.sd) else scored.each.sd]
     ]
     caption = "Mean and standard deviation over runs; grey: baselines on the same grasps."
-    return Chart("Error by what the network is given", charts.ranking(dots, "RMSE (fraction of the range)"), caption)
+    return Chart("Error by inputs of the network", charts.ranking(dots, "RMSE (fraction of the range)"), caption)
 
 
-TITLE = "Figures 10 and 11", "known objects (test) next to novel ones"
+TITLE = "Figures 10 and 11", "known objects (test) and novel objects"
 PARTS = ("RMSE over runs", "R²", "skill")
 
 

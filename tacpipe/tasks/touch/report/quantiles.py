@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 NAMES = {MODEL: "model", CONSTANT: "constant", OBJECT_MEAN: "mean of the object"}
 EXPLAINED = (
-    "A band has its nominal coverage if it is on the dashed line. Intervals are over grasps of known objects, and "
-    "over novel objects; the baselines have the quantiles of their own training errors. The narrowest band with the "
-    "right coverage is best, as measured by the pinball loss (lower is better)."
+    "A band has its nominal coverage if it is on the dashed line. Intervals are over grasps of known objects, "
+    "and over novel objects. The baselines have the quantiles of their training errors. The narrowest band with "
+    "the correct coverage is best, as measured by the pinball loss (lower is better)."
 )
-ELECTRODES = "Coverage in percent. Blue: more than asked for; orange: less."
+ELECTRODES = "Coverage in percent. Blue: above the nominal coverage; orange: below."
 STRONGEST = 0.2  # coverage error with the most saturated colour
 
 
@@ -138,7 +138,7 @@ def _electrode_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) ->
     if not tips:
         return None
     grasps = rows["recording"].nunique()
-    caption = f"{blocks.counted(grasps, 'grasps')}; {100 * nominal:.0f} % is asked for."
+    caption = f"{blocks.counted(grasps, 'grasps')}; nominal coverage {100 * nominal:.0f} %."
     return Chart(
         f"Coverage of each electrode, {headlines.PARTS[known_objects]}", figures.draw_fingertips(tips), caption
     )

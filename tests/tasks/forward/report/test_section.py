@@ -87,7 +87,7 @@ def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> 
         "runs",
     )
     assert cells_of("recurrent · raw", *heads) == ["+0.405", "+0.405", "40", "2", "2"]
-    assert [group.title for group in table.groups] == ["", "Baselines", "Oracles, which know what they predict"]
+    assert [group.title for group in table.groups] == ["", "Baselines", "Oracles, which use the true future"]
 
 
 def test_methods_of_a_family_fold_behind_the_best_one() -> None:
@@ -104,7 +104,7 @@ def test_the_worth_of_the_plan_is_the_difference_to_a_model_without_it() -> None
     section = forward(
         result("raw", ratio=RATIO), result("raw", ratio=none, params={"actions": "none"}), result("PCA-20")
     )
-    (table,) = parts.tables([parts.folds(section)["What the plan and the timeline change"]])
+    (table,) = parts.tables([parts.folds(section)["Effects of the plan and the timeline"]])
     cells = [[cell.split(" | ")[0] for cell in parts.cells(table, name)] for name in ("recurrent · raw", "… none")]
     assert cells[0] == ["+0.646", "–", "–", "+0.134", "–", "–", "1"]
     assert cells[1] == ["+0.516", "+0.131", "+0.131", "−0.008", "+0.142", "+0.142", "1"]
@@ -113,7 +113,7 @@ def test_the_worth_of_the_plan_is_the_difference_to_a_model_without_it() -> None
 def test_timelines_are_next_to_each_other_with_how_long_a_step_lasts() -> None:
     results = [result("raw", seed, ratio=RATIO) for seed in range(2)]
     section = forward(*results, result("raw", ratio=0.25, timeline="fresh", rate_hz=10.0))
-    (table,) = parts.tables([parts.folds(section)["What the plan and the timeline change"]])
+    (table,) = parts.tables([parts.folds(section)["Effects of the plan and the timeline"]])
     assert parts.cells(table, "recurrent · raw · fresh (fresh)")[:2] == ["100", "+0.750"]
     assert [cell.split(" | ")[0] for cell in parts.cells(table, "recurrent · raw (uniform)")[:2]] == ["20", "+0.646"]
 
@@ -130,7 +130,12 @@ def test_of_a_labs_own_data_nothing_is_stated_that_the_paper_states_of_its_own()
         for options in hows
     )
     assert "paper" not in lab_text.lower()
-    for phrase in ("Table 1 in the paper", "in the paper 20 hold", "Figure 5 in the paper", "Figure 6 in the paper"):
+    for phrase in (
+        "Table 1 in the paper",
+        "in the paper, 20 explain",
+        "Figure 5 in the paper",
+        "Figure 6 in the paper",
+    ):
         assert phrase in published, phrase
 
 
@@ -259,7 +264,7 @@ def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -
     texts = {
         name: [
             note.text
-            for note in parts.folds(page)["What these numbers rest on"].blocks
+            for note in parts.folds(page)["Basis and limits"].blocks
             if isinstance(note, SmallPrint) and "look ahead" in note.text
         ]
         for name, page in pages.items()

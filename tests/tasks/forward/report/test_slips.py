@@ -1,4 +1,4 @@
-"""Slips that alarms led, pooled over the runs of a method."""
+"""Slips preceded by alarms, pooled over the runs of a method."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def test_joint_learning_that_hurts_is_stated() -> None:
 def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_driven() -> None:
     permuted = trained({"biotac": 2, "roboskin": 2}, 0.015, pairing="permuted", partners=PARTNERS)
     control = joint.joint_effects(grouped(trained(BOTH, 0.01), permuted))[-1]
-    assert "label-driven" in control
+    assert "driven by labels" in control
     assert "0.015" in control and "0.01" in control and "BioTac 90.0" in control and "95.0" in control
 
 
@@ -54,14 +54,14 @@ def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_drive
 def test_a_control_that_does_worse_does_not(swapped: dict[str, int], alignment: float, told: str) -> None:
     methods_by_name = grouped(trained(BOTH, 0.01), trained(swapped, alignment, pairing="permuted", partners=PARTNERS))
     control = joint.joint_effects(methods_by_name)[-1]
-    assert told in control and "label-driven" not in control
+    assert told in control and "driven by labels" not in control
 
 
 def test_a_control_is_no_evidence_where_real_pairs_have_not_aligned() -> None:
     swapped = {"biotac": 1, "roboskin": 12}
     methods_by_name = grouped(trained(swapped, 0.01), trained(swapped, 0.01, pairing="permuted", partners=PARTNERS))
     control = joint.joint_effects(methods_by_name)[-1]
-    assert "50.0 points" in control and "label-driven" not in control
+    assert "50.0 points" in control and "driven by labels" not in control
 
 
 def test_a_missing_control_and_a_missing_counterpart_are_stated() -> None:

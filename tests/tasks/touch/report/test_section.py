@@ -56,7 +56,7 @@ def test_all_that_there_is_has_its_fold(full_section: Section) -> None:
     assert list(parts.folds(full_section)) == [
         "All methods and baselines", "The pressure, predicted and true", "Electrodes", "Clouds and their grasps",
         "The paper's tables and figures", "By object", "Training", "Recordings", "Every run",
-        "What these numbers rest on", "Where it comes from",
+        "Basis and limits", "Where it comes from",
     ]  # fmt: skip
     text = parts.words(full_section)
     for sentence in ("R² of each electrode, novel objects", "worst decile by error", "Table I in", "Figures 10 and 11 in",
@@ -109,7 +109,7 @@ def test_a_labs_own_grasps_get_nothing_that_the_paper_states_of_its_own(simulate
 
 
 def test_that_an_objects_grasps_follow_one_another_is_stated_where_they_do() -> None:
-    sentence = "of 23 evaluated grasps follow one of the same object in time"
+    sentence = "of 23 evaluated grasps follow a grasp of the same object in time"
     assert f"21 {sentence}" in parts.words(touch(result(published=False)))
     turns = result(published=False)
     tables = turns.recordings["predictions"].tables
@@ -123,7 +123,7 @@ def test_simulated_results_next_to_recorded_ones_are_questions_of_their_own() ->
     section = touch(result(), result(simulated=True))
     text = parts.words(section)
     assert "PDC thumb, known objects, random" in text and "PDC thumb, known objects, random, simulated" in text
-    assert "What is marked simulated is not evidence about a real sensor." in text
+    assert "Results marked as simulated are not evidence about real sensors." in text
     assert "simulated" not in section.sentence
 
 

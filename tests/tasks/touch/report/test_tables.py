@@ -151,7 +151,7 @@ def test_simulated_tables_say_so() -> None:
     text = parts.words(
         paper.setting_tables(methods(*(result("pointnet", head=f"fc{n}", simulated=True, **PDC) for n in (1, 2))))
     )
-    assert "(simulated)" in text and "nothing here is evidence about a real sensor" in text
+    assert "(simulated)" in text and "so the results are not evidence about real sensors" in text
 
 
 def test_figures_10_and_11_tell_known_beside_novel_objects_and_the_change() -> None:
@@ -168,7 +168,7 @@ def test_figures_10_and_11_tell_known_beside_novel_objects_and_the_change() -> N
         "+74",
     ]
     assert "Evaluated on 24 grasps of known and 16 of novel objects." in text
-    assert "The paper's columns are of RGBPose, trained on 9,000 grasps" in text
+    assert "The columns of the paper are for RGBPose, trained on 9,000 grasps" in text
 
 
 def test_known_and_novel_objects_may_come_from_other_splits_of_the_same_network() -> None:
