@@ -25,9 +25,9 @@ import pyarrow as pa
 import tacpipe
 from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
+from tacpipe.simulation.emulation import ledger as ledgers
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.testing import matching
 
 BIN = Path(sys.executable).parent
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -78,7 +78,7 @@ def account_stream(table: pa.Table, ledger: Ledger) -> str:
     """Return what a recorded stream has beside what was sent; raises `AssertionError` for a sample that is wrong."""
     counts = table.column("seq").to_numpy()
     assert np.array_equal(np.diff(counts), np.ones(len(counts) - 1)), "the counter has gaps"
-    assert matching.start_of(table, ledger.samples()) is not None, "what was recorded is not what was sent"
+    assert ledgers.start_of(table, ledger.samples()) is not None, "what was recorded is not what was sent"
     return f"{len(counts):,} of {len(counts):,} sent meanwhile, all values equal"
 
 

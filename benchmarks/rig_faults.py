@@ -24,11 +24,11 @@ from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation import byte_faults
+from tacpipe.simulation.emulation import ledger as ledgers
 from tacpipe.simulation.emulation.byte_faults import Faults, SentItem
 from tacpipe.simulation.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator, frame_pace
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.simulation.emulation.transmission import TransmissionPlan
-from tacpipe.testing import matching
 
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
 USUAL = Faults(
@@ -144,7 +144,7 @@ def _keys(samples: Samples | Batch, reading: LinkReader) -> list[bytes]:
     if samples.seq is not None and modulus is not None:
         unrolled = isinstance(samples, Batch)
         columns.append(samples.seq * reading.sensor.step % modulus if unrolled else samples.seq)
-    return matching.keys(columns)
+    return ledgers.keys(columns)
 
 
 def _longest(ledger: Ledger, delivered_rows: np.ndarray) -> int:

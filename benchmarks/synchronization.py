@@ -111,7 +111,6 @@ def _measure(seconds: int, rounds: int) -> list[timing.Line]:
             resampling.linear(stream.t_ns, stream.values, grid_ns)
             resampling.nearest(stream.t_ns, repairs.repeated_rows(stream.values), grid_ns)
             resampling.in_gap(stream.t_ns, grid_ns, GAP_NS)
-            resampling.nearest_distance_ns(stream.t_ns, grid_ns)
 
     def merge_asof() -> None:
         merged = grid

@@ -114,12 +114,6 @@ def nearest(t_ns: Times, values: AnyArray, grid_ns: Times) -> AnyArray:
     return values[nearest_rows(t_ns, grid_ns)]
 
 
-def nearest_distance_ns(t_ns: Times, grid_ns: Times) -> Times:
-    """Return the absolute distance from each grid point to the nearest sample in ns, int64 (grid,)."""
-    distance_ns: Times = np.abs(t_ns[nearest_rows(t_ns, grid_ns)] - grid_ns)
-    return distance_ns
-
-
 def newest_rows(t_ns: Times, grid_ns: Times) -> Indices:
     """Return the row of the last sample at or before each grid point (grid,), or -1 if there is none.
 

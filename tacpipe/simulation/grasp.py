@@ -66,17 +66,6 @@ def mean_and_variance(possible: Counts) -> tuple[Floats, Floats]:
     return possible.mean(axis=0), possible.var(axis=0, ddof=1)
 
 
-def irreducible_rmse(variances: Floats) -> dict[str, float]:
-    """Return the smallest possible root-mean-square error of each target in counts.
-
-    ``variances`` (situation, finger, channel) are those given the geometry. The error is the root of their mean: C. M.
-    Bishop, *Pattern Recognition and Machine Learning*, 2006, equation (1.90).
-    """
-    mf, th = np.sqrt(variances[:, :, -1].mean(axis=0))
-    e_mf, e_th = np.sqrt(variances[:, :, :-1].mean(axis=(0, 2)))
-    return {"pdc_th": float(th), "pdc_mf": float(mf), "e_th": float(e_th), "e_mf": float(e_mf)}
-
-
 def error_bound(
     hand: fingertip_sp.Sensors, scene: GraspScene, rig: GraspRig, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:

@@ -106,17 +106,6 @@ def carry(
     )
 
 
-def run_profile(
-    acceleration_m_s2: Floats, mass_kg: float, grip_n: float, friction: float, *, rate_hz: float = 1000.0
-) -> Contact:
-    """Simulate the contact of a lifted object under a commanded acceleration: (time,) upwards, or (time, axis)."""
-    commanded = np.asarray(acceleration_m_s2, dtype=np.float64)
-    if commanded.ndim == 1:
-        commanded = np.column_stack([np.zeros((len(commanded), 2)), commanded])
-    grasp = HeldObject(mass_kg, friction, np.full(len(commanded), grip_n))
-    return carry(grasp, commanded, rate_hz=rate_hz)
-
-
 def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, step_s: float) -> Floats:
     """Return force x and z, displacement x and z, velocity x and z, and state (time, 7).
 

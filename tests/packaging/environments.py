@@ -118,8 +118,6 @@ def try_environment(folder: Path, package: Path, extra: str) -> float:
     pip = [str(python), "-m", "pip", "install", "-q", "--no-compile"]  # bytecode is no part of what is measured
     run([*pip, "-c", str(ROOT / "constraints.txt"), requirement], folder)
     installed_mb = size_mb(environment) - bare_mb
-    (testing,) = environment.glob("lib/python*/site-packages/tacpipe/testing")
-    shutil.rmtree(testing)  # Programs do not need it when they run.
     project.mkdir()
     write_box(project / "box.pcd")
     print(run([str(python), "-c", IMPORT_ALL, extra], project), end="")

@@ -25,8 +25,8 @@ from typing import Any
 import tacpipe
 from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
+from tacpipe.simulation.emulation import ledger as ledgers
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.testing import matching
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]
@@ -102,7 +102,7 @@ def _cost(emulator: Emulator, shard: Any, name: str, killed_ns: int, *, complete
     sent_ns = ledger.column("sent_ns")[rows]
     sent = ledger.samples(rows[sent_ns > killed_ns - 20_000_000_000])
     sent_ns = sent_ns[sent_ns > killed_ns - 20_000_000_000]
-    start = matching.start_of(table, sent)
+    start = ledgers.start_of(table, sent)
     assert start is not None, f"{name}: what was recovered is not what was sent"
     stop = start + table.num_rows
     missed = int((sent_ns[stop:] < killed_ns).sum())

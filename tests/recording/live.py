@@ -17,7 +17,7 @@ import tacpipe
 from tacpipe.recording import rig as rig_of
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.testing.matching import STAMPS
+from tacpipe.simulation.emulation.ledger import STAMPS
 from tests.simulation.emulation.rigs import awaited
 
 __all__ = ["awaited"]

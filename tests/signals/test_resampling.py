@@ -103,7 +103,6 @@ def test_nearest_is_what_a_look_at_every_sample_finds(t_ns: np.ndarray, data: st
     grid_ns = np.array(data.draw(st.lists(st.integers(-10, int(t_ns[-1]) + 10), min_size=1)))
     distance = np.abs(t_ns[None] - grid_ns[:, None])
     assert resampling.nearest_rows(t_ns, grid_ns).tolist() == distance.argmin(axis=1).tolist()
-    assert resampling.nearest_distance_ns(t_ns, grid_ns).tolist() == distance.min(axis=1).tolist()
 
 
 def test_nearest_keeps_the_type_and_takes_the_earlier_of_two() -> None:

@@ -16,8 +16,18 @@ from tacpipe.simulation.mechanics import (
     Contact,
     HeldObject,
     carry,
-    run_profile,
 )
+
+
+def run_profile(
+    acceleration_m_s2: np.ndarray, mass_kg: float, grip_n: float, friction: float, *, rate_hz: float = 1000.0
+) -> Contact:
+    """Simulate the contact of a lifted object under a commanded acceleration: (time,) upwards, or (time, axis)."""
+    commanded = np.asarray(acceleration_m_s2, dtype=np.float64)
+    if commanded.ndim == 1:
+        commanded = np.column_stack([np.zeros((len(commanded), 2)), commanded])
+    grasp = HeldObject(mass_kg, friction, np.full(len(commanded), grip_n))
+    return carry(grasp, commanded, rate_hz=rate_hz)
 
 
 def upwards(peak_m_s2: float, seconds: float = 0.3, rate_hz: float = 1000.0) -> np.ndarray:

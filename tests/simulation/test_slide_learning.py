@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from tacpipe.simulation.slide import SlideRig
-from tacpipe.testing.texture_likelihood import likelihood_accuracy
 from tests.simulation.slide_datasets import SEED, indices, slides
+from tests.simulation.texture_likelihood import likelihood_accuracy
 from tests.tasks.material.textures import dataset, evaluated, trained
 
 RIG = SlideRig(materials=8, pac=False, arm_every=0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tacpipe.simulation import texture
 from tacpipe.simulation.slide import SlideRig
-from tacpipe.testing.texture_likelihood import likelihood_accuracy, likelihood_materials, log_likelihoods
+from tests.simulation.texture_likelihood import likelihood_accuracy, likelihood_materials, log_likelihoods
 
 
 def material(seed: int = 0) -> texture.Material:

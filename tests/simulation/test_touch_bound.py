@@ -70,11 +70,3 @@ def test_no_constant_comes_near_the_bound_and_the_readings_keep_to_it() -> None:
         constant = np.sqrt(read.var(axis=0).mean())
         assert np.sqrt((error**2).mean()) == pytest.approx(bound, rel=0.2), target  # they share a drift
         assert bound < 0.85 * constant, target
-
-
-def test_the_least_error_is_the_root_of_the_mean_variance_by_target() -> None:
-    variances = np.zeros((4, 2, 25))
-    variances[:, 0, -1], variances[:, 1, -1] = [9, 9, 25, 25], 4
-    variances[:, 0, :-1], variances[:, 1, :-1] = 1, 36
-    rmse = grasp.irreducible_rmse(variances)
-    assert rmse == pytest.approx({"pdc_mf": np.sqrt(17), "pdc_th": 2, "e_mf": 1, "e_th": 6})

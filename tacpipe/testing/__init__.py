@@ -1,1 +1,0 @@
-"""Helpers that only tests and benchmarks need. Nothing in the package imports them at run time."""
