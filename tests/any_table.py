@@ -31,9 +31,8 @@ def tables(draw: st.DrawFn, *, columns: int = 6) -> pa.Table:
         else draw(st.lists(_names, min_size=1, max_size=columns, unique=True))
     )
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    order = _order(
-        rows, draw(st.sampled_from([1, 2, 50])), rng
-    )  # Rows of the values of all columns, so that full rows repeat.
+    # Rows of the values of all columns, so that full rows repeat.
+    order = _order(rows, draw(st.sampled_from([1, 2, 50])), rng)
     fields, arrays = [], []
     for name in names:
         kind = draw(st.sampled_from(TYPES))

@@ -398,10 +398,8 @@ def test_windows_subtract_the_level_at_rest_of_tactile_channels(four: Dataset) -
 
 
 def test_windows_are_scaled_by_the_rows_that_they_hold_or_as_others_are(lab: Lab) -> None:
-    tables = {
-        "a": synchronized_table(nan=11),
-        "b": synchronized_table(7, gap=0),
-    }  # the last row of a and the first of b are in no window
+    # the last row of a and the first of b are in no window
+    tables = {"a": synchronized_table(nan=11), "b": synchronized_table(7, gap=0)}
     dataset = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
     rows = np.concatenate([np.arange(11.0), np.arange(1, 7.0)])  # Values of left_x.
     windows = dataset.windows(2, 1, inputs=["left_x"], targets=["arm_force_n"], scale=True, dtype="float64")

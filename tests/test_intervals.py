@@ -36,9 +36,8 @@ def test_the_interval_is_students_over_values_that_leave_out_one_recording_each(
             math.log(np.delete(model[:, step], at).sum() / np.delete(baseline[:, step], at).sum()) for at in range(12)
         ]
         error = math.sqrt(11 / 12 * sum((log - np.mean(logs)) ** 2 for log in logs))
-        equal = (
-            baseline[:, step].sum() ** 2 / (baseline[:, step] ** 2).sum()
-        )  # recordings of one size that weigh as much
+        # recordings of one size that weigh as much
+        equal = baseline[:, step].sum() ** 2 / (baseline[:, step] ** 2).sum()
         ratio = model[:, step].sum() / baseline[:, step].sum()
         ends = [1 - ratio * math.exp(sign * stats.t.ppf(0.975, equal - 1) * error) for sign in (1, -1)]
         assert (interval.mean[step], interval.low[step], interval.high[step]) == pytest.approx((1 - ratio, *ends))

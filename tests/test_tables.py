@@ -80,9 +80,8 @@ def test_columns_that_are_asked_for_come_alone(table: pa.Table, data: st.DataObj
 def test_the_same_values_give_the_same_bytes_however_they_lie_in_memory(table: pa.Table, cuts: list[int]) -> None:
     edges = [0, *sorted(min(cut, table.num_rows) for cut in cuts), table.num_rows]
     pieces = [table.slice(start, stop - start) for start, stop in itertools.pairwise(edges)]
-    sliced = pa.concat_tables([table.slice(0, 1), table]).slice(
-        min(1, table.num_rows)
-    )  # begins in the middle of a buffer
+    # begins in the middle of a buffer
+    sliced = pa.concat_tables([table.slice(0, 1), table]).slice(min(1, table.num_rows))
     content = to_parquet(table)
     assert to_parquet(pa.concat_tables(pieces)) == content
     assert to_parquet(sliced) == content

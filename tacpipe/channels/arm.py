@@ -184,9 +184,8 @@ def profile(streams: Mapping[str, pa.Table | Columns], t_ns: Times, *, by_place:
     if speeds is None:
         return {}
     at_ns, raw_m_s = speeds
-    both_m_s = np.column_stack(
-        [raw_m_s, median(raw_m_s, MEDIAN_ROWS)]
-    )  # filtered before interpolation, which would spread spikes
+    # filtered before interpolation, which would spread spikes
+    both_m_s = np.column_stack([raw_m_s, median(raw_m_s, MEDIAN_ROWS)])
     rough_m_s, smooth_m_s = linear(at_ns, both_m_s, t_ns).T
     load = signal(streams, "force")
     force_n = np.full(len(t_ns), np.nan) if load is None else linear(*load, t_ns)[:, 2]

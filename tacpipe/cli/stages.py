@@ -106,9 +106,8 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
     from tacpipe.engine import grid, pipeline  # These imports are not needed for help.
 
     requests = grid.requests(_request(name, stage, params, options), grid.folds(options.get("fold") or "0"))
-    headline_file = (
-        stage.headline if not (options["check"] or options["compare"]) else None
-    )  # Checks and comparisons write nothing.
+    # Checks and comparisons write nothing.
+    headline_file = stage.headline if not (options["check"] or options["compare"]) else None
     report_options = {"as_json": options["json_"], "quiet": options["quiet"]}
     if answering:
         _report_answers(requests, headline_file, **report_options)

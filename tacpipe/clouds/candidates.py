@@ -41,12 +41,10 @@ EDGE_FRACTION = 0.2  # fraction of a cut's width that counts as an edge
 TRIES = 3  # cuts tried for each candidate; the best one is used
 MAX_VIEW_COSINE = 0.9  # cosine to the view above which the object points at the camera, so its axis is not used
 OFF_PLANE_WEIGHT = 0.4  # weight of the mean distance to the plane (each cosine has 1); chosen on the published grasps
-OFF_CENTRE_WEIGHT = (
-    0.5  # weight of the distance to the centroid: an object that is gripped far from it rotates in the hand
-)
-G1_TO_G2 = np.array([1.0, 1.0, 0.0]) / np.sqrt(
-    2
-)  # g1 to g2 points right and down in the picture in all published grasps
+# weight of the distance to the centroid: an object that is gripped far from it rotates in the hand
+OFF_CENTRE_WEIGHT = 0.5
+# g1 to g2 points right and down in the picture in all published grasps
+G1_TO_G2 = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
 
 
 @dataclass(frozen=True)
@@ -229,10 +227,8 @@ def _grasp(left: Floats, right: Floats, camera_m: Floats) -> Grasp:
 
 
 G1, G2 = "#d55e00", "#0072b2"  # distinguishable with red-green colour blindness
-GREY, BACKGROUND = (
-    "#707070",
-    "#ececec",
-)  # points without colours, and the background, on which white points are visible
+# points without colours, and the background, on which white points are visible
+GREY, BACKGROUND = "#707070", "#ececec"
 
 
 def draw(cloud: Cloud, grasp_candidates: Sequence[Candidate], path: Path) -> None:

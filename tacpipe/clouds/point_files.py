@@ -26,11 +26,8 @@ from tacpipe.printable import excerpt, listed, plain
 
 KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 VERSIONS = ("0.7", ".7")
-KINDS = {
-    "F": ("f", (4, 8)),
-    "I": ("i", (1, 2, 4, 8)),
-    "U": ("u", (1, 2, 4, 8)),
-}  # numpy's letter, sizes in bytes
+# numpy's letter, sizes in bytes
+KINDS = {"F": ("f", (4, 8)), "I": ("i", (1, 2, 4, 8)), "U": ("u", (1, 2, 4, 8))}
 POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name is valid; the alpha of rgba is ignored
 MAX_HEADER_BYTES = 65_536  # a file without a DATA line in these is not PCD

@@ -137,9 +137,8 @@ def _largest_plane(points_m: Floats, limits: SegmentationLimits, seed: int) -> F
         sampled = np.random.default_rng(seed).choice(points_m, MAX_PLANE_POINTS, replace=False)
     with open3d() as library:
         library.utility.random.seed(seed)
-        plane, _ = _cloud(library, sampled).segment_plane(
-            limits.plane_m, 3, limits.plane_trials, probability=1.0
-        )  # probability 1 makes all trials: with fewer, the result would depend on the number of threads
+        # probability 1 makes all trials: with fewer, the result would depend on the number of threads
+        plane, _ = _cloud(library, sampled).segment_plane(limits.plane_m, 3, limits.plane_trials, probability=1.0)
     normalised = np.asarray(plane, dtype=np.float64)
     normalised /= np.linalg.norm(normalised[:3])
     return normalised if normalised[3] >= 0 else -normalised

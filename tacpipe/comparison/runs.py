@@ -122,9 +122,8 @@ class ComparedRun:
     seed: Hashable = None
     fold: Hashable = None
     simulated: bool = False
-    control: bool = (
-        False  # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
-    )
+    # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
+    control: bool = False
     published: bool = False  # whether it was evaluated only on the recordings of the task's paper
     details: Any = None  # data for the task's own sections
 

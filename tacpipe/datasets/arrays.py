@@ -26,14 +26,8 @@ if TYPE_CHECKING:
 
 TIME = "t_ns"
 CLOCKS = (TIME, "t_device_ns", "seq", "device_seq")  # clocks and counters, for columns without metadata
-NOT_CHANNELS = (
-    "time",
-    "sequence",
-    "mask",
-    "label",
-    "status",
-    "text",
-)  # quantities of columns that are not measurements
+# quantities of columns that are not measurements
+NOT_CHANNELS = ("time", "sequence", "mask", "label", "status", "text")
 EXACT = 1 << 53  # a float64 represents every integer up to this
 
 

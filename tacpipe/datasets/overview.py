@@ -73,11 +73,8 @@ def _recorded_name(name: str, stream: str) -> str:
     return name.removeprefix(f"{stream}_") if stream else name
 
 
-_NAMED, _PARAMS, _LABELS = (
-    4,
-    6,
-    8,
-)  # number of recordings or files, params and labels listed before the others are counted
+# number of recordings or files, params and labels listed before the others are counted
+_NAMED, _PARAMS, _LABELS = 4, 6, 8
 _VALUES = 5  # a label with more values is only counted
 
 

@@ -35,11 +35,8 @@ BEGINS = b'{"labels":'  # prefix of the content of every page
 EXCLUDED = "excluded"  # attribute of recordings that stages skip
 _PARSED = 256  # maximum number of parsed pages in memory, about 80 MB
 _WRITTEN_BYTES = 1 << 25  # maximum size of cached JSON of a key
-_OPTIONAL: tuple[Literal["labelled", "sourced", "excluded"], ...] = (
-    "labelled",
-    "sourced",
-    "excluded",
-)  # counts that are often 0
+# counts that are often 0
+_OPTIONAL: tuple[Literal["labelled", "sourced", "excluded"], ...] = ("labelled", "sourced", "excluded")
 _COUNTS = ("bytes", "recordings", "rows", "shard_bytes", *_OPTIONAL)
 _ATTRIBUTES = frozenset((str, int, float, bool, type(None)))
 

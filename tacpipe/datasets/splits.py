@@ -31,9 +31,8 @@ class Scheme:
     """How recordings are assigned to roles."""
 
     name: str = "random"
-    val: float = (
-        0.15  # fraction of the recordings, or of the training recordings if the scheme selects the test recordings
-    )
+    # fraction of the recordings, or of the training recordings if the scheme selects the test recordings
+    val: float = 0.15
     calibration: float = 0.0  # fraction for calibration, of the same recordings as val
     test: float = 0.15  # fraction of the recordings; ignored if the scheme selects them
     seed: int = 0
@@ -45,9 +44,8 @@ class Scheme:
     reverse: bool = False  # blocked: test the first recordings and train on the last
     few: int = 0  # number of training recordings, the others are unused; 0 for all
     few_by: str = ""  # attribute with ``few`` training recordings per value; empty for ``few`` in total
-    few_of: str = (
-        ""  # attribute=value of the recordings that ``few`` applies to, such as sensor=roboskin; empty for all
-    )
+    # attribute=value of the recordings that ``few`` applies to, such as sensor=roboskin; empty for all
+    few_of: str = ""
 
 
 def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:

@@ -245,9 +245,8 @@ def _stage(name: str, definition: Values, values: Values, file: Path, place: str
             f"relative to {file.name}, or run it with `dvc repro`."
         )
     folder = file.parent.absolute().as_posix()
-    files = [
-        entry for entry in resolved.get("params", []) if isinstance(entry, Mapping)
-    ]  # params files other than params.yaml
+    # params files other than params.yaml
+    files = [entry for entry in resolved.get("params", []) if isinstance(entry, Mapping)]
     reads = _paths([*resolved.get("deps", []), *files], folder, place)
     writes = [path for kind in _OUTPUTS for path in dict.fromkeys(_paths(resolved.get(kind, []), folder, place))]
     for path in writes:

@@ -360,9 +360,8 @@ def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
         yield ()
         return
     store = opened(task.store)
-    local_workspace = (
-        None if store.distant else workspace(store, digest(task.identity))
-    )  # the workspace of a remote store is in the worker's folder
+    # the workspace of a remote store is in the worker's folder
+    local_workspace = None if store.distant else workspace(store, digest(task.identity))
     with display.followers_on_stderr(registry.stage_name(task.name), local_workspace) as displays:
         yield (*following.trackers(), *displays)
 

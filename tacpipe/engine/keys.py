@@ -46,9 +46,8 @@ class Done:
     error: str = ""
     exit_code: int = 0
     is_new: bool = True  # False if another process finished first
-    at_fault: bool = (
-        True  # whether the recording caused the error, rather than the disk, a damaged input or another process
-    )
+    # whether the recording caused the error, rather than the disk, a damaged input or another process
+    at_fault: bool = True
 
 
 class DatasetLineage(TypedDict):

@@ -45,9 +45,8 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     recordings_by_note: dict[str, list[str]] = field(default_factory=dict)  # recordings by the stage's note about them
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # number of results by stage and digest of its code
-    packages: dict[str, dict[str, int]] = field(
-        default_factory=dict
-    )  # number of results by plug-in package and digest of its code
+    # number of results by plug-in package and digest of its code
+    packages: dict[str, dict[str, int]] = field(default_factory=dict)
     unlike: list[str] = field(default_factory=list)  # differences between the computers that produced differing results
 
     def begin(self) -> None:

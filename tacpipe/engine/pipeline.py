@@ -36,10 +36,8 @@ from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracker
 from tacpipe.training import following
 
-_NOTHING: RecordingEntry = {
-    "attributes": {},
-    "shards": {},
-}  # entry of a recording whose part of the stage returns only files
+# entry of a recording whose part of the stage returns only files
+_NOTHING: RecordingEntry = {"attributes": {}, "shards": {}}
 
 
 def open_dataset(path: Path | str) -> Dataset:

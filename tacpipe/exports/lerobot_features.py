@@ -227,9 +227,8 @@ def dataset_statistics(
     weights = np.array(list(lengths.values()), float)[:, None] / sum(lengths.values())
     statistics: Stats = {}
     for feature in episodes[0]:
-        stacked = {
-            name: np.array([values[feature][name] for values in episodes]) for name in STATISTICS
-        }  # (episode, channel)
+        # (episode, channel)
+        stacked = {name: np.array([values[feature][name] for values in episodes]) for name in STATISTICS}
         mean = (weights * stacked["mean"]).sum(0)
         spread = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(0)
         statistics[feature] = {

@@ -47,9 +47,8 @@ class Time:
     rate_hz: Rate | None = None
     origin: Literal["unix", "start"] = "unix"  # time zero of numbers: 1970, or the start of the recording
     zone: str = "UTC"  # time zone of ISO 8601 timestamps without one, such as Europe/Berlin
-    start: str = (
-        ""  # ISO 8601, UTC: first timestamp of recordings that count from their start, or the date of times of day
-    )
+    # ISO 8601, UTC: first timestamp of recordings that count from their start, or the date of times of day
+    start: str = ""
     file: str = ""  # pattern of a file with the timestamps of all rows
     format: str = ""  # strptime format of text timestamps, such as %d.%m.%Y %H:%M:%S.%f; without %Y, times of day
 

@@ -36,9 +36,8 @@ if TYPE_CHECKING:
 BLOCK = re.compile(r"icub_(?:(?:fold|val)_(\d+)|(test))\.npy")
 PLACE = re.compile(r"(.+\.npy)\[(\d+)\]")
 MAX_READING = 255.0  # readings have eight bits, with temperature compensation
-ALONG_TIME = (
-    0.85  # lag-1 autocorrelation: published slides have 0.92 or more along time and 0.82 or less along other axes
-)
+# lag-1 autocorrelation: published slides have 0.92 or more along time and 0.82 or less along other axes
+ALONG_TIME = 0.85
 UNREADABLE = (
     *(ValueError, EOFError, SyntaxError, LookupError, TypeError, RecursionError, OverflowError),
     tokenize.TokenError,

@@ -32,10 +32,8 @@ TWIN = "duplicate_of="  # prefix of the name of an earlier grasp's file with the
 UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 onwards
 VALUES = 58  # values per reading: 29 of the middle finger, then 29 of the thumb
 MAX_COUNT = 4095  # counts of a 12-bit converter
-POINTS, WITH_WRIST = (
-    6,
-    15,
-)  # numbers per grasp: two points, optionally followed by the wrist's rotation matrix, row by row
+# numbers per grasp: two points, optionally followed by the wrist's rotation matrix, row by row
+POINTS, WITH_WRIST = 6, 15
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,8 @@ from tacpipe.io.parquet_claims import Claims
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
-REPEATED_SHARE = (
-    0.25  # fraction of repeated rows above which zstd beats delta packing; see docs/reference/recordings.md
-)
+# fraction of repeated rows above which zstd beats delta packing; see docs/reference/recordings.md
+REPEATED_SHARE = 0.25
 LARGE_BYTES = 1 << 25  # size in memory
 BATCH_ROWS = 1024  # Arrow's default
 PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 rows could exceed the 2 GiB limit of a page

@@ -21,14 +21,8 @@ DATA, DICTIONARY = 0, 2  # page types
 PLAIN, DELTA_LENGTH = 0, 6  # encodings whose texts have their own length
 INDEXES = (2, 8)  # encodings whose texts are in a dictionary
 INDEX = 4  # size of a dictionary index in memory
-WIDTHS = {
-    "BOOLEAN": 1,
-    "INT32": 4,
-    "INT64": 8,
-    "INT96": 12,
-    "FLOAT": 4,
-    "DOUBLE": 8,
-}  # size of a value in memory by type
+# size of a value in memory by type
+WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
 OFFSET = 8  # size of a text's offset in memory
 _VARINT = rb"([\x80-\xff]*[\x00-\x7f])"
 _SMALL = rb"[\x00-\x7f]"  # a number of one byte

@@ -83,9 +83,8 @@ class RowsInMemory:
                 return
 
     def _first(self, rows: int) -> pa.Table:
-        return self._next.slice(
-            0, min(rows, self._next.num_rows)
-        )  # slice() of a table without columns has the requested number of rows
+        # slice() of a table without columns has the requested number of rows
+        return self._next.slice(0, min(rows, self._next.num_rows))
 
     def _fill(self, rows: int) -> bool:
         """Buffer ``rows`` rows, or all remaining ones; return whether there are enough."""

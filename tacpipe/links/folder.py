@@ -16,14 +16,8 @@ from tacpipe.sensors.sensor import Sensor
 
 SCAN_S = 0.02  # pause between scans of the folder
 SETTLED_S = 0.1  # a file counts as complete if it did not change for this time
-UNFINISHED = (
-    ".tmp",
-    ".part",
-    ".partial",
-    ".crdownload",
-    ".swp",
-    "~",
-)  # suffixes of temporary names
+# suffixes of temporary names
+UNFINISHED = (".tmp", ".part", ".partial", ".crdownload", ".swp", "~")
 FileState = tuple[int, int, int]  # inode, size in bytes, time of the last change in ns
 
 

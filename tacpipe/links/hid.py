@@ -141,9 +141,8 @@ class Reports:
     """The reports that a HID device sends."""
 
     usage_page: int = 0  # the first usage page
-    bits: dict[int, int] = field(
-        default_factory=dict
-    )  # bits per report, by report number; the number is 0 if reports are not numbered
+    # bits per report, by report number; the number is 0 if reports are not numbered
+    bits: dict[int, int] = field(default_factory=dict)
 
     @property
     def has_numbers(self) -> bool:

@@ -17,11 +17,8 @@ from tacpipe.printable import plain
 from tacpipe.sensors.sensor import LocalAddress, Sensor
 
 CONNECT_S = 5.0
-KEEPALIVE_IDLE_S, KEEPALIVE_PAUSE_S, KEEPALIVE_PROBES = (
-    2,
-    1,
-    3,
-)  # silence before the first probe, pause, number of probes
+# silence before the first probe, pause, number of probes
+KEEPALIVE_IDLE_S, KEEPALIVE_PAUSE_S, KEEPALIVE_PROBES = 2, 1, 3
 
 
 def parse_host_port(scheme: str, text: str) -> tuple[str, int]:

@@ -34,9 +34,8 @@ def open_websocket(target: str, sensor: Sensor, name: str) -> WebsocketLink:
 
     host_and_port, _, path = target.partition("/")
     host, port = network.parse_host_port("ws", host_and_port)
-    tcp_socket = network.connect(
-        host, port, name
-    )  # connect here: no proxy is used, and errors have the same texts as those of other links
+    # connect here: no proxy is used, and errors have the same texts as those of other links
+    tcp_socket = network.connect(host, port, name)
     try:
         connection = connect(
             f"ws://{host_and_port}/{path}",

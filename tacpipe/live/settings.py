@@ -197,9 +197,8 @@ class SessionPlan:
 class LiveTask(ABC):
     """A task's part of live sessions. Modules of subclasses import torch and pyarrow only inside methods."""
 
-    settings: ClassVar[
-        type[TaskSettings]
-    ]  # dataclass of its settings: options of ``tacpipe live`` and keys of ``[live]``
+    # dataclass of its settings: options of ``tacpipe live`` and keys of ``[live]``
+    settings: ClassVar[type[TaskSettings]]
     declaration: ClassVar[Declaration]  # the values of its messages
 
     @abstractmethod

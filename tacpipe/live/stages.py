@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.store.records import Step
 
-EARLIER_VERSIONS = {
-    "synchronize": (2,)
-}  # earlier versions whose params today's stage reads and whose rows it reproduces
+# earlier versions whose params today's stage reads and whose rows it reproduces
+EARLIER_VERSIONS = {"synchronize": (2,)}
 
 
 def stage_params(step: Step) -> Any:

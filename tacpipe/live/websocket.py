@@ -30,10 +30,8 @@ QUEUED = 16  # messages that wait for a subscriber; a third of a second at 50 Hz
 QUEUED_BYTES = 1 << 20  # limit of their size
 SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
 BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
-RECEIVED_BYTES, RECEIVED_BYTES_S = (
-    1 << 14,
-    1 << 10,
-)  # a client may send: the first for its request, then so many a second
+# a client may send: the first for its request, then so many a second
+RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
 OPEN_S = 2.0  # limit of a handshake
 END_S = 1.0  # limit of closing all connections
 SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that goes is no error

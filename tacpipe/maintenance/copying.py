@@ -35,9 +35,8 @@ class _Plan:
     """The manifests and objects to copy."""
 
     manifests: dict[str, bytes] = field(default_factory=dict)  # content by digest
-    objects: dict[str, tuple[str, int]] = field(
-        default_factory=dict
-    )  # path in the dataset and size in bytes, by digest
+    # path in the dataset and size in bytes, by digest
+    objects: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def sizes(self) -> dict[str, int]:
         """Return the sizes of all manifests and objects in bytes."""

@@ -54,9 +54,8 @@ class LiveObjects:
     pages: set[str] = field(default_factory=set)  # digests of manifest pages among all these
     manifests: list[Manifest] = field(default_factory=list)  # manifests of recordings among all these
     doubtful: set[Path] = field(default_factory=set)  # quarantined files that name objects which may be recordings
-    runs: set[str] = field(
-        default_factory=set
-    )  # names of running processes' leases, which are prefixes of their drafts
+    # names of running processes' leases, which are prefixes of their drafts
+    runs: set[str] = field(default_factory=set)
 
 
 def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:

@@ -30,13 +30,8 @@ from tacpipe.store.store import AbsentError, MissingError, Store
 
 _SHOWN = 10  # number of foreign files listed before the others are counted
 _Measured = Literal["objects", "records", "quarantine", "tmp", "checkpoints"]
-_MEASURED: tuple[_Measured, ...] = (
-    "objects",
-    "records",
-    "quarantine",
-    "tmp",
-    "checkpoints",
-)  # folders that the status lists
+# folders that the status lists
+_MEASURED: tuple[_Measured, ...] = ("objects", "records", "quarantine", "tmp", "checkpoints")
 
 
 class FolderSize(TypedDict):
@@ -78,9 +73,8 @@ class Soundness:
     there: bool = True  # False if the store does not exist yet
     objects: int = 0
     records: int = 0
-    foreign: list[str] = field(
-        default_factory=list
-    )  # paths in the store that do not belong to it; they are not changed
+    # paths in the store that do not belong to it; they are not changed
+    foreign: list[str] = field(default_factory=list)
     damaged: list[str] = field(default_factory=list)  # digests and keys that are now in quarantine
     missing: list[str] = field(default_factory=list)  # missing objects of roots' manifests
     repaired: list[str] = field(default_factory=list)

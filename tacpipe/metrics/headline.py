@@ -18,9 +18,8 @@ from typing import Any, TypedDict
 from tacpipe.io import Json
 
 FILE = "headline.json"
-MIN_CLUSTERS = (
-    6  # minimum for a verdict: 5 clusters all favour the same side with probability 1/16, which is more than 5 %
-)
+# minimum for a verdict: 5 clusters all favour the same side with probability 1/16, which is more than 5 %
+MIN_CLUSTERS = 6
 BETTER, WORSE, UNCLEAR, NO_VERDICT = "better", "worse", "unclear", ""
 NONE = "–"
 
@@ -291,9 +290,8 @@ def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})
         "high": weakest.high,
         "n": weakest.clusters,
     }
-    targets = (
-        len({headline.target for headline in headlines}) > 1
-    )  # all targets have the same measure, so its name is omitted
+    # all targets have the same measure, so its name is omitted
+    targets = len({headline.target for headline in headlines}) > 1
     for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
         summary["_".join(place if targets else [*place, _to_identifier(headline.columns[-1])])] = headline.model.values[
             -1

@@ -88,10 +88,8 @@ def student_quantile(freedom: float, level: float) -> float:
         return math.nan
     scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(math.pi)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    low, high = (
-        0.0,
-        math.atan((10 if freedom > 30 else 200) / math.sqrt(freedom)),
-    )  # a wider range would miss a narrow peak
+    # a wider range would miss a narrow peak
+    low, high = 0.0, math.atan((10 if freedom > 30 else 200) / math.sqrt(freedom))
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         powers = np.exp((freedom - 1) * np.log(np.cos(middle * (nodes + 1) / 2)))
@@ -126,9 +124,8 @@ def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None =
     if seeds > 1:
         seed_variance = _variance(_influences(statistic, total, sums.sum(axis=1)))
         seed_variance = 2 * seed_variance if seeds == 2 else seed_variance  # else intervals cover less than 92 %
-        seed_variance = np.maximum(
-            seed_variance - _variance_of_cells(statistic, total, sums), 0
-        )  # it is part of both variances
+        # it is part of both variances
+        seed_variance = np.maximum(seed_variance - _variance_of_cells(statistic, total, sums), 0)
         total_variance = variance + seed_variance
         shares = np.square(variance) / freedom + np.square(seed_variance) / (seeds - 1)
         freedom = np.where(shares > 0, np.square(total_variance) / np.where(shares > 0, shares, 1), freedom)

@@ -44,9 +44,8 @@ class Measure:
     score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # errors (draw,) to the values of charts (draw,)
     scored: str = "error"  # the name of ``score``, with its unit
     rises: bool = False  # True if a higher score is better
-    weight: Callable[[AnyFloats], AnyFloats] = (
-        _equal_weights  #  a baseline's sums (cluster, part) to the weights of clusters (cluster,)
-    )
+    # a baseline's sums (cluster, part) to the weights of clusters (cluster,)
+    weight: Callable[[AnyFloats], AnyFloats] = _equal_weights
     reference: str = ""  # the baseline that tables show next to the best one
 
     def score_of(self, parts: Iterable[AnyFloats]) -> float:

@@ -19,9 +19,8 @@ from tacpipe.models import lstm
 from tacpipe.models.windows import MOTION, UP, ForecastShape, ForecastWindows, motion, repeats
 
 CELLS = ("gru", "lstm", "tcn")
-CLIP_DEVIATIONS = (
-    8.0  # standard deviations to which inputs are clipped, so that a jump of a sensor does not dominate a window
-)
+# standard deviations to which inputs are clipped, so that a jump of a sensor does not dominate a window
+CLIP_DEVIATIONS = 8.0
 
 
 class ChangeForecast(nn.Module):
@@ -198,13 +197,8 @@ def motion_with_acceleration(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
 
 TRAITS = 16  # size of the learned embedding of a taxel's position
 RANK = 32
-LAGS = (
-    9,
-    7,
-    5,
-    3,
-    1,
-)  # past rows that are compared with the last row; samples repeat, so adjacent rows are often equal
+# past rows that are compared with the last row; samples repeat, so adjacent rows are often equal
+LAGS = (9, 7, 5, 3, 1)
 
 
 class TaxelwiseForecast(ChangeForecast):
@@ -306,9 +300,8 @@ class TaxelwiseForecast(ChangeForecast):
         # changes of a few counts and of thousands both matter, so their logarithms are used
         fine = torch.cat([torch.asinh(8 * change / self.change_scale), torch.asinh(2 * level / self.change_scale)])
         own = torch.cat([fine, plain]).permute(1, 2, 0, 3).flatten(2)  # (window, taxel, lag and axis)
-        sensors = plain.view(
-            *plain.shape[:2], self.sensors, self.taxels, self.axes
-        )  # (lag, window, sensor, taxel, axis)
+        # (lag, window, sensor, taxel, axis)
+        sensors = plain.view(*plain.shape[:2], self.sensors, self.taxels, self.axes)
         load = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
         steps, up = self.arm(windows)
         past = steps[: windows.context].transpose(0, 1).flatten(1)

@@ -14,9 +14,8 @@ from tacpipe.models.lstm import lstm
 from tacpipe.models.windows import POSE, ForecastWindows
 
 CANDIDATE_WEIGHTS = torch.linspace(0, 1, 21)  # candidate weights; the best is chosen for each step
-PRIOR_LOSS = (
-    0.05  # prior: a virtual recording on which the full forecast is worse by this fraction of persistence's error
-)
+# prior: a virtual recording on which the full forecast is worse by this fraction of persistence's error
+PRIOR_LOSS = 0.05
 
 
 class Ensemble(nn.Module):

@@ -38,9 +38,8 @@ NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_acti
 ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # for standardised features and sums over windows, as in scikit-learn
 PHIS = tuple(step / 20 for step in range(21))
 CHUNK = 2048  # windows per chunk: 35 MB with 1,100 features and 960 targets
-RIDGE_SHARE = (
-    1e-6  # fraction of NLinear's mean square that regularises it: repeated frames make its matrix nearly singular
-)
+# fraction of NLinear's mean square that regularises it: repeated frames make its matrix nearly singular
+RIDGE_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -274,9 +273,8 @@ def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias:
     quadratic = (basis.T @ evaluated.xx @ basis) * (xy @ xy.T)
     linear = np.einsum("fy,fy->f", xy, basis.T @ evaluated.xy)
     shrinks = [1 / (np.maximum(values, 0) + alpha) for alpha in ALPHAS]
-    errors = [
-        shrink @ quadratic @ shrink - 2 * shrink @ linear for shrink in shrinks
-    ]  # without the term that does not depend on alpha
+    # without the term that does not depend on alpha
+    errors = [shrink @ quadratic @ shrink - 2 * shrink @ linear for shrink in shrinks]
     best = int(np.argmin(errors))
     weight = basis @ (shrinks[best][:, None] * xy)
     return AffineMap(centre.astype(np.float32), weight.astype(np.float32), bias.astype(np.float32), ALPHAS[best])

@@ -120,9 +120,8 @@ class _Layer(torch.autograd.Function):
         used = size + inputs.shape[-1]
         weights = from_state.new_empty(4 * size, used + 1)
         weights[:, :size], weights[:, size:used], weights[:, used] = from_state, from_input, bias
-        weights[2 * size : 3 * size] *= (
-            2  # tanh(a) = 2 sigmoid(2 a) - 1, and torch's sigmoid takes a quarter of the time
-        )
+        # tanh(a) = 2 sigmoid(2 a) - 1, and torch's sigmoid takes a quarter of the time
+        weights[2 * size : 3 * size] *= 2
         read = _pooled_empty(inputs, steps + 1, windows, used + 1)  # h', x and a 1 that multiplies b
         read[0, :, :size] = 0.0 if hidden is None else hidden
         read[:-1, :, size:used] = inputs

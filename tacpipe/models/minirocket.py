@@ -209,11 +209,8 @@ def _validate_slides(x: AnyFloats) -> None:
 
 
 QUANTILES = (0.5, 0.75, 0.9, 1.0)  # over the channels at each moment
-STRENGTH_WEIGHTS = (
-    0.0,
-    0.3,
-    1.0,
-)  # candidate weights of strength, relative to 1 for patterns; a finer grid would select it by chance
+# candidate weights of strength, relative to 1 for patterns; a finer grid would select it by chance
+STRENGTH_WEIGHTS = (0.0, 0.3, 1.0)
 
 
 @dataclass(frozen=True)

@@ -200,9 +200,8 @@ class Level:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a class of one slide adds nothing to the covariance
             analysis.fit((levels - centre)[:, moves] * gain[moves], labels)
-        signs = (
-            np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None
-        )  # for two classes, scikit-learn fits only their difference
+        # for two classes, scikit-learn fits only their difference
+        signs = np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None
         weight = np.zeros((x.shape[2], len(classes)))
         coefficients = analysis.coef_ if signs is None else signs[:, None] * analysis.coef_
         weight[moves] = gain[moves, None] * coefficients.T

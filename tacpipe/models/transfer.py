@@ -25,9 +25,8 @@ from tacpipe.errors import TacpipeError
 
 MIN_SHARED = 3  # minimum number of classes for fitting the map between two sensors
 PULL = 0.5  # weight of the gain of all features in the gain of each, as a fraction of a feature's mean sum of squares
-REGULARISATION = (
-    1e-4  # fraction of a covariance's mean variance that is added to each variance, because features may be collinear
-)
+# fraction of a covariance's mean variance that is added to each variance, because features may be collinear
+REGULARISATION = 1e-4
 
 
 @dataclass(frozen=True)
@@ -194,14 +193,12 @@ def _validate_slides(slides: Labelled, number: int) -> None:
 
 
 BANDS = 16
-MIN_PERIODS = (
-    3.0  # minimum number of periods of the longest wave; a slower wave cannot be separated from a change of pressure
-)
+# minimum number of periods of the longest wave; a slower wave cannot be separated from a change of pressure
+MIN_PERIODS = 3.0
 MAX_FREQUENCY_FRACTION = 0.6  # maximum frequency as a fraction of the Nyquist frequency, to avoid aliasing
 LINES_PER_BAND = 4  # number of spatial frequencies per band
-LEADING_FRACTION = (
-    0.3  # fraction of the channels that is used, those with the highest level; others may not be in contact
-)
+# fraction of the channels that is used, those with the highest level; others may not be in contact
+LEADING_FRACTION = 0.3
 HOP = 0.25  # distance between windows, as a fraction of their length
 ROUNDING_POWER = 1 / 12  # counts^2, noise power of rounding to integers: no spectrum is below it
 CHUNK = 256  # slides per chunk

@@ -101,9 +101,8 @@ def command(extra: str) -> str:
         return " ".join([pip, "install", *_pip_arguments(source, extra)])
     if distribution is not None and _from_index(distribution):
         return f"{pip} install {shlex.quote(f'{NAME}[{extra}]')}"
-    requires = (
-        (distribution.requires or []) if distribution is not None else []
-    )  # if the source no longer exists, install only the packages of the extra
+    # if the source no longer exists, install only the packages of the extra
+    requires = (distribution.requires or []) if distribution is not None else []
     packages = [text.partition(";")[0].strip() for text in requires if _extra(text) == extra]
     return " ".join([pip, "install", *(shlex.quote(package) for package in packages)])
 

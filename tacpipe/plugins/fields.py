@@ -19,13 +19,11 @@ from tacpipe.plugins.stage import Values
 from tacpipe.printable import excerpt, plain, suggestion
 
 REFUSED = object()
-_EXPONENT = re.compile(
-    r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+"
-)  # YAML 1.1 reads 1e-3 as text, contrary to all other formats
+# YAML 1.1 reads 1e-3 as text, contrary to all other formats
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 Annotation: typing.TypeAlias = Any  # type of a field, such as int | None or Literal["a", "b"]
-_HINTS: dict[
-    type[Any], Mapping[str, Any]
-] = {}  # cache, because evaluating the annotations of many fields takes milliseconds
+# cache, because evaluating the annotations of many fields takes milliseconds
+_HINTS: dict[type[Any], Mapping[str, Any]] = {}
 _UNIONS = (typing.Union, types.UnionType)
 
 

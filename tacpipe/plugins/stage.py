@@ -134,9 +134,8 @@ class Stage(Generic[P, R]):
     # attributes that the function reads; None for no attribute of a Recording and all of a Dataset
     reads: tuple[str, ...] | None = None
     fit: AnyStage | None = None  # computes the files of a ``Fitted`` argument
-    part: AnyStage | None = (
-        None  # runs on each recording; its files become files of the result, its tables are ``Parts``
-    )
+    # runs on each recording; its files become files of the result, its tables are ``Parts``
+    part: AnyStage | None = None
     first: First | None = None  # preceding stages, depending on the params
     originals: Callable[[Any], str] | None = None  # folder of the result for input shards; empty for none
     discover: Discover | None = None

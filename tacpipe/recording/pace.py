@@ -89,9 +89,8 @@ class Stalls:
     """Collect the stalls of one stream from its notes, and correct its timestamps."""
 
     def __init__(self) -> None:
-        self._windows: list[
-            tuple[int, int, int]
-        ] = []  # first and last timestamp, last time at which the link was empty
+        # first and last timestamp, last time at which the link was empty
+        self._windows: list[tuple[int, int, int]] = []
         self._suspended: list[tuple[int, int]] = []  # first timestamp after a suspension, duration of the suspension
 
     def add(self, note: StreamNote) -> StreamFault | None:

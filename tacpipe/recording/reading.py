@@ -41,9 +41,8 @@ class CounterUnroller:
 
     def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
         self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
-        self._last: tuple[int, int, int] | None = (
-            None  # highest count as sent, the same unrolled, and its arrival in ns
-        )
+        # highest count as sent, the same unrolled, and its arrival in ns
+        self._last: tuple[int, int, int] | None = None
         # The last count before a reset and the size of the jump: a single wrong count looks like a reset.
         self._before_reset: tuple[int, int] | None = None
         self._may_have_restarted = False

@@ -33,9 +33,8 @@ FOLDER = layout.SPOOL  # folder of the store
 STARTUP_S = 60.0  # a younger spool without a header may belong to a process that is starting
 NAME = re.compile(r"[0-9a-f]{32}")  # name of a spool's folder
 FILES = ("header.json", ".header.json", "tally", "bytes")  # in order of removal: a spool without header is not sealed
-READ = (
-    os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-)  # opening a pipe without writers would otherwise block
+# opening a pipe without writers would otherwise block
+READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 def own_user_ids(folder: Path, existing: Iterable[int]) -> frozenset[int]:

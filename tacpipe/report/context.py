@@ -36,9 +36,8 @@ if TYPE_CHECKING:
 
 Config = TypeVar("Config", bound="ModelConfig")
 CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `tacpipe calibrate` adds
-SHORTENED = (
-    "shortened"  # setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
-)
+# setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
+SHORTENED = "shortened"
 GROWS = "trained_on"  # a part that also contains the recordings of the calibration
 
 

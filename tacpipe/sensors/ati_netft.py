@@ -42,9 +42,8 @@ class AtiNetFT(Sensor):
     counter: ClassVar[int | None] = 1 << 32
     exclusive: ClassVar[str] = "The box sends to one program: if another requests records, they stop here."
 
-    rate_hz: float = (
-        7000.0  # RDT output rate on the box's communications page: internal_hz, or that divided by a whole number
-    )
+    # RDT output rate on the box's communications page: internal_hz, or that divided by a whole number
+    rate_hz: float = 7000.0
     internal_hz: float = 7000.0  # internal sampling rate in Hz: 7000 for a Net F/T, 7912 for an Ethernet Axia
     counts_per_force: float = 0.0  # counts per newton on the box's configuration page; 0: counts are not converted
     counts_per_torque: float = 0.0  # counts per newton metre; 0: counts are not converted

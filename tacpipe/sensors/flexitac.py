@@ -33,9 +33,8 @@ class FlexiTac(Sensor):
     summary: ClassVar[str] = (
         "FlexiTac: a grid of piezoresistive taxels with any number of rows and columns, read by an Arduino."
     )
-    line: ClassVar[SerialLine] = SerialLine(
-        settle_s=2.0
-    )  # opening the port resets an Arduino, which boots for up to 2 s
+    # opening the port resets an Arduino, which boots for up to 2 s
+    line: ClassVar[SerialLine] = SerialLine(settle_s=2.0)
 
     rows: int = 12  # rows of the grid, as in the firmware
     columns: int = 32  # columns of the grid, as in the firmware

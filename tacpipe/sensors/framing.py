@@ -114,9 +114,8 @@ class Framing:
     check: Callable[[Bytes], Bools] | None = None  # returns the mask (frame,) of good frames (frame, byte)
     lock: int = 2  # number of consecutive good frames needed to lock
     confirm: int = 0  # number of good frames that must follow a frame before it is returned
-    weak: bool = (
-        False  # ``check`` is not a checksum: with a constant payload, bytes that are not a frame may pass repeatedly
-    )
+    # ``check`` is not a checksum: with a constant payload, bytes that are not a frame may pass repeatedly
+    weak: bool = False
 
     @property
     def has_checksum(self) -> bool:

@@ -53,15 +53,8 @@ STATE = np.dtype(
     + [("robot_mode", "u1"), ("success_rate", "<f4")]
 )
 MEASURED, TARGET = "O_T_EE", "O_T_EE_d"  # poses
-READ = (
-    MEASURED,
-    "q",
-    "dq",
-    "tau_J",
-    "tau_ext_hat_filtered",
-    "O_F_ext_hat_K",
-    "success_rate",
-)  # floats that become channels
+# floats that become channels
+READ = (MEASURED, "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")
 MODES = ("robot_mode", "motion_mode", "control_mode")
 ERRORS = ("errors", "last_errors")
 

@@ -50,9 +50,8 @@ class Generic(layout.DescribedSensor):
     sum: layout.Sum | None = None  # the checksum of a frame, and the number that contains it
     sequence: layout.Sequence | None = None  # the number that counts the frames
     clock: layout.Clock | None = None  # the number that contains the device's time
-    length: layout.Length | None = (
-        None  # the number that contains the size of a frame; if absent, all frames have the same size
-    )
+    # the number that contains the size of a frame; if absent, all frames have the same size
+    length: layout.Length | None = None
     packets: bool = False  # each packet of the link is one frame (udp, hid), so no marker is needed
     start: str = ""  # bytes that start the stream, in hexadecimal; empty: the board streams by itself
     stop: str = ""  # bytes that stop the stream, in hexadecimal
@@ -75,9 +74,8 @@ class Generic(layout.DescribedSensor):
         self._check_roles()
         span = self._spans[self.clock.number] if self.clock is not None else None
         if self.clock is not None and span is not None and span.dtype.kind in "ui" and span.width < 8:
-            wrap_ns = (
-                span.value_count * layout.UNITS_NS[self.clock.unit]
-            )  # a u32 in microseconds wraps after 71.6 minutes
+            # a u32 in microseconds wraps after 71.6 minutes
+            wrap_ns = span.value_count * layout.UNITS_NS[self.clock.unit]
             object.__setattr__(self, "device_wrap_ns", wrap_ns)
 
     def _check_names(self) -> None:

@@ -157,11 +157,8 @@ MAX_TRIANGLES, TAXELS, HEAD_TAXELS = 16, 12, 7
 THERMAL = (7, 11)
 PERIODIC, OLD_PERIODIC, POLLING = 4, 3, 2  # classes of identifiers
 BOARD, TRIANGLE, TRANSMIT, OLD_TIMING, OLD_TRIANGLES = 0x4D, 0x50, 0x07, 0x4C, 0x4E  # commands
-NO_LOAD, SHIFT, OFFSET = (
-    0xF0,
-    2,
-    0x2200,
-)  # taxel at rest, gain and offset of the converter, as in the robot's configuration files
+# taxel at rest, gain and offset of the converter, as in the robot's configuration files
+NO_LOAD, SHIFT, OFFSET = 0xF0, 2, 0x2200
 
 
 @dataclass(frozen=True)

@@ -39,9 +39,8 @@ class JustFloat(Sensor):
     summary: ClassVar[str] = "Boards that send JustFloat, the format of VOFA+, such as fulai tactile skins."
     line: ClassVar[SerialLine] = SerialLine(dtr=True, rts=False)
 
-    model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = (
-        "any"  # hardware version of a fulai skin, or "any" for other boards
-    )
+    # hardware version of a fulai skin, or "any" for other boards
+    model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = "any"
     channels: int = 0  # number of floats in a frame, for model any; 0: the number of names
     names: tuple[str, ...] = ()  # channel names for model any; if empty, taxel01, taxel02, …
     unit: str = "1"  # unit of the channels, for model any

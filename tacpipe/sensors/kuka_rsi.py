@@ -32,13 +32,8 @@ if TYPE_CHECKING:
 
 CYCLES_MS = (4, 12)
 FRAME, AXES = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{axis}" for axis in range(1, 7))
-ATTRIBUTES = {
-    "RIst": FRAME,
-    "RSol": FRAME,
-    "AIPos": AXES,
-    "ASPos": AXES,
-    "MACur": AXES,
-}  # elements whose attributes become columns
+# elements whose attributes become columns
+ATTRIBUTES = {"RIst": FRAME, "RSol": FRAME, "AIPos": AXES, "ASPos": AXES, "MACur": AXES}
 POSES, ANGLES = ("RIst", "RSol"), ("AIPos", "ASPos")
 OUTPUT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)?")  # an element, or ELEMENT.ATTRIBUTE
 TRUTH = {"true": "1", "false": "0"}
@@ -60,10 +55,8 @@ class KukaRsi(Sensor):
         "arm at the same time. Let that program forward the messages to a tap."
     )
 
-    outputs: tuple[str, ...] = (
-        "RIst",
-        "AIPos",
-    )  # elements that the controller sends, or their attributes, such as Tech.C11
+    # elements that the controller sends, or their attributes, such as Tech.C11
+    outputs: tuple[str, ...] = ("RIst", "AIPos")
     only_send: bool = False  # the configuration sets ONLYSEND TRUE: no answers are sent, which is best for recording
     sen_type: str = "ImFree"  # SENTYPE of the configuration
     rate_hz: float = 250.0  # messages per second: 250 for a cycle of 4 ms, 83.33 for 12 ms

@@ -122,9 +122,8 @@ class NumberSpan:
         data = np.ascontiguousarray(frames[:, self.start : self.stop])
         if self.width != 3:
             return data.view(self.dtype.newbyteorder(_byte_order(self.order))).astype(self.dtype, copy=False)
-        padded = np.zeros(
-            (len(data), self.length, 4), dtype=np.uint8
-        )  # the samples fill the upper three bytes, so the sign bit is in the right place
+        # the samples fill the upper three bytes, so the sign bit is in the right place
+        padded = np.zeros((len(data), self.length, 4), dtype=np.uint8)
         triples = data.reshape(len(data), self.length, 3)
         padded[:, :, 1:] = triples if self.order == "little" else triples[:, :, ::-1]
         return padded.view(self.dtype.newbyteorder("<"))[:, :, 0].astype(self.dtype) >> 8

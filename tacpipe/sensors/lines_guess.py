@@ -88,9 +88,8 @@ def _lines(data: Chunks) -> tuple[list[str], Times]:
     stop = data.data.rfind(b"\n")
     raw = data.data[: stop + 1].split(b"\n")[:-1]
     ends = np.cumsum([len(line) + 1 for line in raw]) - 1 if raw else np.zeros(0, dtype=np.int64)
-    first = int(
-        not (raw and raw[0].startswith(tuple(mark.encode() for mark in COMMENTS)))
-    )  # the first line may be incomplete
+    # the first line may be incomplete
+    first = int(not (raw and raw[0].startswith(tuple(mark.encode() for mark in COMMENTS))))
     raw, ends = raw[first : MAX_LINES + 1], ends[first : MAX_LINES + 1]
     try:
         lines = [line.strip().decode("ascii") for line in raw]

@@ -30,15 +30,8 @@ ADDRESS, SENDING, SENDING_HZ, UNIT, COUNT, ZERO = 0x01, 0x0B, 0x0C, 0x0D, 0x0F, 
 REFUSALS = {1: "unknown function", 2: "unknown register", 3: "value out of range"}
 BROADCAST, HEADER = 0, 4
 INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # texts of the emulated device
-REGISTERS = {
-    ADDRESS: 1,
-    SENDING: 0,
-    SENDING_HZ: 100,
-    UNIT: 1,
-    COUNT: 60,
-    0x0E: 20,
-    0x10: 250,
-}  # registers after power-up
+# registers after power-up
+REGISTERS = {ADDRESS: 1, SENDING: 0, SENDING_HZ: 100, UNIT: 1, COUNT: 60, 0x0E: 20, 0x10: 250}
 
 
 @dataclass(frozen=True)

@@ -159,9 +159,8 @@ class Paxini(Sensor):
         "thumb_tip",
     )  # slots with a module, from thumb_proximal to little_nail and palm1 to palm8
     variants: tuple[str, ...] = ("DP-S2015-Elite",)  # the product in each of these slots, or one product for all
-    data: Literal["both", "resultant", "distributed"] = (
-        "both"  # resultant: each module's total force; distributed: the forces of its points; or both
-    )
+    # resultant: each module's total force; distributed: the forces of its points; or both
+    data: Literal["both", "resultant", "distributed"] = "both"
     rate_hz: float = 91.0  # frames per second, fixed by the board
     baud: int = 921_600  # baud rate of the board
 

@@ -114,9 +114,8 @@ class Sensor:
     counter: ClassVar[int | None] = None  # modulus of ``seq``; None: the device has no counter
     device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
     step: ClassVar[int] = 1  # increment of ``seq`` between two samples
-    device_wrap_ns: ClassVar[int | None] = (
-        None  # time after which the device's clock wraps to 0; None: it does not wrap
-    )
+    # time after which the device's clock wraps to 0; None: it does not wrap
+    device_wrap_ns: ClassVar[int | None] = None
     listens: ClassVar[bool] = False  # True if the device sends by UDP to an address that is configured in the device
     steady: ClassVar[bool] = True  # True if it sends at its rate all the time; False: only on events
     exclusive: ClassVar[str] = ""  # sentence on programs that cannot use the device at the same time; empty: no limit

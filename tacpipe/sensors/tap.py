@@ -42,9 +42,8 @@ class Tap(Sensor):
     listens: ClassVar[bool] = True
 
     numbers: tuple[str, ...] = ()  # keys that become columns, with optional units: "width_m:m", "pose.x", "q.0:rad"
-    grasp: Literal["", "points", "wrist"] = (
-        ""  # record only grasps: their points, or points and wrist; empty: all records
-    )
+    # record only grasps: their points, or points and wrist; empty: all records
+    grasp: Literal["", "points", "wrist"] = ""
     counted: bool = False  # each record has a key seq that increases by 1, so that losses are detected
     timed: bool = False  # each record has a key t_ns, the time of its values in ns on the program's clock
     rate_hz: float = 0.0  # records per second; 0: irregular

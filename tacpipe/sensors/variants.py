@@ -10,12 +10,8 @@ from tacpipe.sensors import camera, lines_guess, lsl
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Options, OptionValue
 
-GRIDS = {
-    384: (12, 32),
-    256: (16, 16),
-    512: (16, 32),
-    1024: (32, 32),
-}  # rows and columns of known boards, by number of taxels
+# rows and columns of known boards, by number of taxels
+GRIDS = {384: (12, 32), 256: (16, 16), 512: (16, 32), 1024: (32, 32)}
 MIN_TAXELS = 64  # smallest unknown board, because many other devices use the same two marker bytes
 MIN_DEGC, MAX_DEGC = -40.0, 85.0  # operating range of the magnetometers of an AnySkin
 MAX_DISTANCES = 3  # number of distances between marks that are tried

@@ -265,10 +265,8 @@ def _map_times(segments: tuple[Segment, ...], device_ns: Times) -> Times:
 
 
 NEIGHBOURS = 3  # measurements before and after a jump that are compared to detect a reset
-LINE_OFFSETS, LINE_OFFSETS_NS = (
-    3,
-    10_000_000_000,
-)  # smallest number of measurements and duration from which a drift is estimated
+# smallest number of measurements and duration from which a drift is estimated
+LINE_OFFSETS, LINE_OFFSETS_NS = 3, 10_000_000_000
 MAX_PAIRED = 512  # largest number of measurements for pairwise slopes; longer series are subsampled
 
 

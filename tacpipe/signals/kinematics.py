@@ -179,9 +179,8 @@ def carries_hand(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats)
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
     joint_rad, hand_m = joint_rad[finite], hand_m[finite]
     last = last_frames(chain, joint_rad)
-    tool_m = np.einsum(
-        "tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3]
-    )  # (time, 3), in the frame of the last link
+    # (time, 3), in the frame of the last link
+    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 
@@ -192,9 +191,8 @@ def rotates_with_hand(chain: KinematicChain, joint_rad: AnyFloats, quaternions: 
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(quaternions).all(axis=1)
     last = last_frames(chain, joint_rad[finite])[:, :3, :3]
-    tool = last.transpose(0, 2, 1) @ quaternions_to_matrices(
-        quaternions[finite]
-    )  # (time, 3, 3), in the frame of the last link
+    # (time, 3, 3), in the frame of the last link
+    tool = last.transpose(0, 2, 1) @ quaternions_to_matrices(quaternions[finite])
     return bool(len(tool)) and bool((tool.std(axis=0) < TURN_SPREAD).all())
 
 
@@ -239,9 +237,8 @@ def difference_velocity(t_ns: Times, position_m: AnyFloats, quaternions: AnyFloa
     step_s = np.where(step_s > 0, step_s, np.inf)[:, None]
     velocity[1:, :3] = np.diff(position_m, axis=0) / step_s
     before, after = quaternions[:-1], quaternions[1:]
-    turned = (
-        before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] - np.cross(after[:, :3], before[:, :3])
-    )  # (time - 1, 3), the vector part of after times the inverse of before
+    # (time - 1, 3), the vector part of after times the inverse of before
+    turned = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] - np.cross(after[:, :3], before[:, :3])
     velocity[1:, 3:] = 2 * turned / step_s
     return velocity
 

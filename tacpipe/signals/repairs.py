@@ -33,9 +33,8 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
     half = rows // 2
     if not 0 < half < len(values):
         return is_spike, repaired
-    wide = np.flatnonzero(
-        values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor
-    )  # other channels have no spikes
+    # other channels have no spikes
+    wide = np.flatnonzero(values.max(axis=0).astype(np.float64) - values.min(axis=0) > floor)
     if not len(wide):
         return is_spike, repaired
     block_rows = max(1, BLOCK_VALUES // len(wide))

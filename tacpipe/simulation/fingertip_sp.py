@@ -28,12 +28,8 @@ PRESSURE_COUNT_N = 140.0  # slope
 FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # bounds of the readings
 DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods of the drift
 DAY_NS = 86_400_000_000_000
-OTHERS_COUNT = {
-    "pac0": (2037, 2049),
-    "pac1": (2037, 2049),
-    "tac": (2152, 2051),
-    "tdc": (2620, 2449),
-}  # values by finger
+# values by finger
+OTHERS_COUNT = {"pac0": (2037, 2049), "pac1": (2037, 2049), "tac": (2152, 2051), "tdc": (2620, 2449)}
 OTHERS_NOISE_COUNT = {"pac0": 8.0, "pac1": 8.0, "tac": 10.0, "tdc": 6.0}
 VIBRATION_COUNT_S_N = 3.0  # PAC per rate of change of the force
 

@@ -24,10 +24,8 @@ from tacpipe.simulation.depth_camera import Placed
 FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
 MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}
 SHARES = (0.6, 0.2, 0.2)  # fractions of the objects by entry of MODULI_PA
-TAPER, NARROW = (
-    (0.08, 0.22),
-    0.4,
-)  # range of the slope of cones, within friction, and smallest ratio of the radii of top and bottom
+# range of the slope of cones, within friction, and smallest ratio of the radii of top and bottom
+TAPER, NARROW = (0.08, 0.22), 0.4
 REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
 SPHERES_M = (0.012, 0.058)  # range of their radii
 

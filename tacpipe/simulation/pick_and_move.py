@@ -255,9 +255,8 @@ def _loss_row(
     """
     aloft = rise_m >= rise_m.max() / 2
     start, stop = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
-    sticking = np.cumsum(
-        np.append(0, load_n <= (1 - loss) * grasp.limit_n)
-    )  # number of earlier rows in which friction holds
+    # number of earlier rows in which friction holds
+    sticking = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))
     sliding = aloft.copy()
     sliding[-stop:] = False
     sliding[:-stop] &= sticking[stop:-1] == sticking[start : start - stop - 1]

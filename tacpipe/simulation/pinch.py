@@ -58,10 +58,8 @@ FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # force of the joints at the smallest and th
 OPENING_M = (0.02, 0.12)
 SQUEEZE_M = (0.008, 0.012)  # range of the closing distance beyond contact
 COMMON = 0.8  # common fraction of the variance of both fingers' log effort
-CENTRE_M = (
-    (0.0038, 0.0),
-    (-0.0013, 0.0),
-)  # position of a level contact along and around the finger, without the thumb's side offset
+# position of a level contact along and around the finger, without the thumb's side offset
+CENTRE_M = ((0.0038, 0.0), (-0.0013, 0.0))
 SIDE_M = (0.003, 0.005)  # range of the side offset of the thumb's contact
 BEND_RAD = 0.3  # angle of the last joint at the smallest opening; it is straight at the widest
 SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's pose

@@ -27,11 +27,8 @@ PLACES_M = places.uskin_m()  # (taxel, axis)
 SIGMA_M = (0.004, 0.006)  # standard deviation of the Gaussian that distributes the pressure
 CENTRE_M = 0.003  # largest distance of its centre from the pad's centre along each axis
 TWIST_M_NM = 0.02  # shift of the centre of pressure per torque
-GAIN_COUNT_N = (
-    1500.0,
-    1500.0,
-    3250.0,
-)  # x, y, z; chosen with `BULGE` for the standard deviations of the published recordings
+# x, y, z; chosen with `BULGE` for the standard deviations of the published recordings
+GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)
 OFF_AXIS = 0.05  # fraction of a force that acts on the other axes
 QUADRATIC_N = 0.03  # q as a fraction of the gain, at one newton
 CROSSTALK = 0.08  # fraction of a taxel's signal in its four neighbours
@@ -85,9 +82,8 @@ def shear(cap_n: Floats, load_n: Floats) -> Floats:
     ordered = np.sort(cap_n, axis=1)
     taxels = cap_n.shape[1]
     below = np.cumsum(ordered, axis=1) - ordered  # load of the taxels with smaller caps, if they are capped
-    level = (total[:, None] - below) / (
-        taxels - np.arange(taxels)
-    )  # load of each remaining taxel if this one is not capped
+    # load of each remaining taxel if this one is not capped
+    level = (total[:, None] - below) / (taxels - np.arange(taxels))
     fits = level <= ordered  # the first taxel for which this is True and those after it are not capped
     borne = np.minimum(cap_n, np.take_along_axis(level, fits.argmax(axis=1)[:, None], axis=1))
     full = ~fits.any(axis=1)

@@ -19,10 +19,8 @@ from tacpipe.arrays import Floats
 
 GRATINGS = 3
 WAVELENGTH_M = (0.0025, 0.014)
-BACKGROUND_M = (
-    0.0015,
-    0.040,
-)  # wavelengths of the background; longer ones would act as a slope, and shorter ones are not measured
+# wavelengths of the background; longer ones would act as a slope, and shorter ones are not measured
+BACKGROUND_M = (0.0015, 0.040)
 ROUGHNESS_N = (0.15, 0.35)  # range of the standard deviation of a surface
 AMPLITUDE = (0.15, 1.0)  # range of the relative amplitudes of gratings
 EXPONENT = (0.8, 1.8)  # range of the exponent of the background's power spectrum

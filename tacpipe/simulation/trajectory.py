@@ -29,11 +29,8 @@ JOLT_S = (0.06, 0.6)  # range of T for further legs; short ones make the object 
 SPEED_M_S = 1.0  # largest V; the limit of a Panda's hand is 1.7 m/s
 LEG_M = (0.30, 0.15, 0.40)  # longest leg along x, y, z; the published legs have 0.30 m
 AFTER_LIFT_S = 1.5  # shortest time of a trial after the lift
-BOX_M = (
-    (-0.25, 0.25),
-    (-0.15, 0.15),
-    (0.10, 0.40),
-)  # region in which a person carries the object, relative to the start
+# region in which a person carries the object, relative to the start
+BOX_M = ((-0.25, 0.25), (-0.15, 0.15), (0.10, 0.40))
 PEAK_M_S2 = (1.0, 8.0)  # range of the peak acceleration of a minimum-jerk segment; the maximum also applies to legs
 REACH = (0.05, 1.0)  # range of the fraction of the distance to the target that a segment covers; short ones are shakes
 MIN_SEGMENT_S = 0.12

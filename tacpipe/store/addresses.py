@@ -102,9 +102,8 @@ def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ
         return ClientSettings({"account_name": account}, url=f"az://{container_path}")
     if address.scheme != "s3":
         return ClientSettings()
-    client_settings = ClientSettings(
-        {"disable_bulk_delete": True}
-    )  # not every server supports bulk deletion, and objects are deleted one at a time
+    # not every server supports bulk deletion, and objects are deleted one at a time
+    client_settings = ClientSettings({"disable_bulk_delete": True})
     profile = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
     if profile or not any(environment.get(name) for name in _OWN):
         _fill(client_settings, profile, environment)

@@ -336,8 +336,7 @@ def _open(path: Path, *, create: bool) -> int:
         return os.open(path, os.O_RDWR | flags, 0o666)
     except PermissionError as error:
         try:
-            return os.open(
-                path, os.O_RDONLY | os.O_NOFOLLOW
-            )  # belongs to another user of the store: read-only access is enough to wait for it
+            # belongs to another user of the store: read-only access is enough to wait for it
+            return os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
         except FileNotFoundError:
             raise error from None

@@ -56,9 +56,8 @@ class Note:
     """A note as stored."""
 
     head: Head
-    shelves: Mapping[
-        str, tuple[State | None, int, int, str]
-    ]  # state, first row, number of rows and their digest, by shelf
+    # state, first row, number of rows and their digest, by shelf
+    shelves: Mapping[str, tuple[State | None, int, int, str]]
     file: Path
     body: int  # offset of the rows in the file
 

@@ -88,9 +88,8 @@ class RemoteStore:
     def _expect_conditional(self) -> None:
         tried = f"tmp/.{uuid.uuid4().hex}"
         self.files.create(tried, b"1")
-        replaced = self.files.create(
-            tried, b"2"
-        )  # with other content, so that a lost response does not count as success
+        # with other content, so that a lost response does not count as success
+        replaced = self.files.create(tried, b"2")
         self.files.delete(tried)
         if replaced:
             raise UsageError(

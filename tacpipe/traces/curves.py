@@ -16,17 +16,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TIME = "t_ns"
-_UNDRAWN_QUANTITIES = (
-    "time",
-    "sequence",
-    "mask",
-    "label",
-    "image",
-    "colour",
-    "tactile",
-    "prediction",
-    "latent",
-)  # quantities
+# quantities
+_UNDRAWN_QUANTITIES = ("time", "sequence", "mask", "label", "image", "colour", "tactile", "prediction", "latent")
 _NO_UNIT = ("", "1")
 
 

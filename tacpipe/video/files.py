@@ -40,9 +40,8 @@ MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
 WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files without presentation times
 NOMINAL = "from nominal rate"  # origin of timestamps computed from a file's frame rate
 FROM_PTS = "from presentation times"  # origin of timestamps computed from a file's presentation times
-FRAME_TOLERANCE = (
-    1e-6  # tolerance of times relative to the grid of the nominal rate, in frames, in addition to one tick
-)
+# tolerance of times relative to the grid of the nominal rate, in frames, in addition to one tick
+FRAME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,8 @@ if TYPE_CHECKING:
 
 START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
 END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
-PIXEL_FORMATS = {
-    (1, 1): "yuvj444p",
-    (2, 1): "yuvj422p",
-    (2, 2): "yuvj420p",
-    (1, 2): "yuvj440p",
-}  # by ratio of luma to chroma
+# by ratio of luma to chroma
+PIXEL_FORMATS = {(1, 1): "yuvj444p", (2, 1): "yuvj422p", (2, 2): "yuvj420p", (1, 2): "yuvj440p"}
 
 
 class ImageShape(NamedTuple):

@@ -91,9 +91,8 @@ class DrawnContents:
     clouds: list[Points] = field(default_factory=list)
     frames: list[Frames] = field(default_factory=list)
     forecasts: list[DrawnForecast] = field(default_factory=list)
-    predicted: Mapping[str, Attribute] = field(
-        default_factory=dict
-    )  # values that a model predicted for the full recording
+    # values that a model predicted for the full recording
+    predicted: Mapping[str, Attribute] = field(default_factory=dict)
     classification: Classification | None = None  # class that a model predicted for the full recording
     strips: list[FrameStrip] = field(default_factory=list)
     markers: list[MarkerTrack] = field(default_factory=list)

@@ -185,9 +185,8 @@ def _draw_lanes(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
     for place, (lane, spans) in enumerate(lanes.items()):
         colour = drawing.FAULT if lane == "gaps" else drawing.indexed_colour(place)
-        bars: dict[
-            tuple[tuple[str, str], ...], list[tuple[float, float]]
-        ] = {}  # bars by style; bars of the same style are drawn at once
+        # bars by style; bars of the same style are drawn at once
+        bars: dict[tuple[tuple[str, str], ...], list[tuple[float, float]]] = {}
         for span in spans:
             left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
             bars.setdefault(tuple(_style(span, colour).items()), []).append((left, width))

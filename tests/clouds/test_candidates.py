@@ -126,9 +126,8 @@ def test_a_seed_gives_the_same_candidates_again_and_another_one_others() -> None
 
 def test_of_a_cloud_of_many_points_those_looked_at_lie_all_over_it() -> None:
     dense = shapes.cylinder(0.03, 0.2, points=3 * MAX_POINTS)
-    along = Cloud(
-        dense.points_m[np.argsort(dense.points_m[:, 1])]
-    )  # the first third of the points is a third of the body
+    # the first third of the points is a third of the body
+    along = Cloud(dense.points_m[np.argsort(dense.points_m[:, 1])])
     reached = np.ptp(ends(candidates(along))[:, 0, 1])
     assert reached > 0.12
 

@@ -193,13 +193,8 @@ def test_a_walk_finds_what_os_walk_finds_and_circles_end(tmp_path: Path) -> None
     assert list(files.walk(tmp_path / "absent")) == []
 
 
-LISTING = {
-    "walk",
-    "glob",
-    "rglob",
-    "iterdir",
-    "fwalk",
-}  # functions of os, glob and pathlib that pass over errors, or raise them bare
+# functions of os, glob and pathlib that pass over errors, or raise them bare
+LISTING = {"walk", "glob", "rglob", "iterdir", "fwalk"}
 ALLOWED = {"holders.py"}  # looks at other users' processes, which may not be looked at
 
 

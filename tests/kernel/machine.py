@@ -10,14 +10,8 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-MODULES = (
-    "virtio_pci",
-    "9pnet_virtio",
-    "9p",
-    "hid_generic",
-    "uhid",
-    "vivid",
-)  # The machine needs these modules for its root, for HID devices, and for a camera that is none.
+# The machine needs these modules for its root, for HID devices, and for a camera that is none.
+MODULES = ("virtio_pci", "9pnet_virtio", "9p", "hid_generic", "uhid", "vivid")
 BOOT_S = 300
 TRAILER = "TRAILER!!!"
 INIT = """#!/bin/busybox sh

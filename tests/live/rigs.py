@@ -23,9 +23,8 @@ from tests.stage_params import fitting
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
-ASKED = CalibrationRequest(
-    (5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0
-)  # the defaults of `tacpipe calibrate`
+# the defaults of `tacpipe calibrate`
+ASKED = CalibrationRequest((5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0)
 # Four epochs of small batches: with fewer steps the weight of the forecast is 0, and every forecast is persistence.
 SMALL = {"architecture": "gru", "hidden": 8, "epochs": 4, "batch": 16, "context": 4, "horizon": 3}
 Made = tuple[Mapping[str, bytes], Sequence[Step]]

@@ -225,10 +225,8 @@ def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_i
     assert session.run(10**19)[-1].probabilities is not None
 
 
-PAUSE_NS, FREE_ROWS = (
-    400_000_000,
-    120,
-)  # duration of a pause; rows in which nothing is touched between two slides, at 100 Hz
+# duration of a pause; rows in which nothing is touched between two slides, at 100 Hz
+PAUSE_NS, FREE_ROWS = 400_000_000, 120
 
 
 def touches() -> tuple[Any, list[int]]:

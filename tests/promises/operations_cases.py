@@ -285,7 +285,6 @@ STAGES = (
     *(_ingest(name) for name in CONTAINERS),
 )
 CASES = {case.name: case for case in (*TOYS, *STAGES)}
-PART = int(
-    os.environ.get("TACPIPE_TEST_CALLS", "3")
-)  # So many of a stage's calls are skipped for each that is tried; 1 tries all of each stage.
+# So many of a stage's calls are skipped for each that is tried; 1 tries all of each stage.
+PART = int(os.environ.get("TACPIPE_TEST_CALLS", "3"))
 assert len(CASES) == len(TOYS) + len(STAGES)

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 PAST_NS = 1_500_000_000 * 10**9  # when everything was written at first, so that whatever is written since stands out
-_CHANCE = re.compile(
-    r"[0-9a-f]{32}(?![0-9a-f])|\d{19}|(?<=\.)[0-9a-f]{12}(?=\.draft)"
-)  # This differs from run to run in names.
+# This differs from run to run in names.
+_CHANCE = re.compile(r"[0-9a-f]{32}(?![0-9a-f])|\d{19}|(?<=\.)[0-9a-f]{12}(?=\.draft)")
 _Traits = tuple[int, int, int, int]  # inode, size, mode, time
 
 

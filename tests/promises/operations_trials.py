@@ -70,10 +70,8 @@ def main() -> None:
     options = parser.parse_args()
     os.environ.pop("TACPIPE_STORE", None)
     os.environ["TACPIPE_LOCK_TIMEOUT_S"] = "10"
-    os.environ |= {
-        "ZARR_ASYNC__CONCURRENCY": "1",
-        "ZARR_THREADING__MAX_WORKERS": "1",
-    }  # Calls must not depend on which thread is first.
+    # Calls must not depend on which thread is first.
+    os.environ |= {"ZARR_ASYNC__CONCURRENCY": "1", "ZARR_THREADING__MAX_WORKERS": "1"}
     hashing.SETTLED_NS = 0  # calls must not depend on what time it is
     projects.new_id = lambda: "ab" * 16  # Identities must not depend on chance.
     os.fsync = os.fdatasync = lambda handle: None  # type: ignore[assignment]  # nobody takes the power away here

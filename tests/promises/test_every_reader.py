@@ -587,9 +587,8 @@ def _filtered(folder: Path) -> None:
         file["demo_0/t_s"] = np.arange(5.0)
         file.create_dataset("demo_0/a", data=np.arange(5.0), chunks=(5,), shuffle=True)
     content = (folder / "a.hdf5").read_bytes()
-    filter_description = (
-        struct.pack("<HH", 2, 8) + struct.pack("<HH", 1, 1) + b"shuffle\0"
-    )  # number, length of the name, flags, values
+    # number, length of the name, flags, values
+    filter_description = struct.pack("<HH", 2, 8) + struct.pack("<HH", 1, 1) + b"shuffle\0"
     assert content.count(filter_description) == 1
     (folder / "a.hdf5").write_bytes(
         content.replace(filter_description, struct.pack("<H", 31999) + filter_description[2:])

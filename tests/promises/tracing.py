@@ -36,16 +36,8 @@ FAULTS = {  # system call to what can come of it: an error, `short` (no byte tak
     "ioctl": ("EIO",),
     "copy_file_range": ("EIO", "ENOSPC"),
 }
-LASTING = (
-    "write",
-    "pwrite64",
-    "fsync",
-    "fdatasync",
-    "rename",
-    "link",
-    "unlink",
-    "mkdir",
-)  # Faults of these calls also last from then on.
+# Faults of these calls also last from then on.
+LASTING = ("write", "pwrite64", "fsync", "fdatasync", "rename", "link", "unlink", "mkdir")
 _LINE = re.compile(r"^(\d+) +(\w+)\((.*)")
 _RELATIVE = re.compile(r'^(?:AT_FDCWD<[^>]*>, )?"([^"]*)"')
 SLOW_US = 300_000
@@ -84,9 +76,8 @@ def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: 
     traced = ",".join(f"?{name}" for name in names or FAULTS)
     command = ["strace", "-f", "-qq", "-y", "-s", "4096", "-e", f"trace={traced}", "-e", "signal=none", "-o", str(log)]
     command += ["-e", f"inject={inject}"] if inject else []
-    path = os.pathsep.join(
-        filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    )  # an empty part is the folder
+    # an empty part is the folder
+    path = os.pathsep.join(filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
     ran = subprocess.run(
         [
             *command,

@@ -181,9 +181,8 @@ def test_what_is_recorded_before_a_trigger_arrived_within_half_a_second(
     now_ns = time.monotonic_ns()
     monkeypatch.setattr(clock, "now_ns", lambda: now_ns)
     sent = frames(3000)
-    late = chunks(
-        range(3000), sent, now_ns - 3000 * PERIOD_NS
-    )  # three seconds in one block, as while a trial is sealed
+    # three seconds in one block, as while a trial is sealed
+    late = chunks(range(3000), sent, now_ns - 3000 * PERIOD_NS)
     recorder._watch("a", [late])
     spool = Spool(tmp_path, {"rig": RIG}, ["a", "b"])
     with recorder.recording(spool, preroll=True):

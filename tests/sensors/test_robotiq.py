@@ -19,9 +19,8 @@ from tacpipe.sensors.sensor import Samples
 from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
 
 BOTH = Robotiq()
-FINGER = bytes.fromhex(
-    "9A 00 58 0D 20 FF FE 34 00 01 80 00 7F FF 60 00 19"
-)  # a dynamic 0, an acceleration 1, a temperature 0
+# a dynamic 0, an acceleration 1, a temperature 0
+FINGER = bytes.fromhex("9A 00 58 0D 20 FF FE 34 00 01 80 00 7F FF 60 00 19")
 
 
 def random_samples(sensor: Robotiq, count: int, seed: int) -> Samples:

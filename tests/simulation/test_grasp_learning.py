@@ -82,9 +82,8 @@ def test_scaling_each_cloud_to_a_unit_box_hides_what_only_size_tells_and_metres_
 
 @pytest.mark.long
 def test_on_known_families_the_strong_model_errs_at_most_1_3_times_what_nobody_can_know(tmp_path: Path) -> None:
-    rig = GraspRig(
-        families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0
-    )  # Drift would be learned from time.
+    # Drift would be learned from time.
+    rig = GraspRig(families="sphere,cylinder", stiffness="rigid", drift_count_day=0.0)
     training, tested = grasps(rig, range(1000)), grasps(rig, range(1000, 1200))
     metrics = evaluated(training, tested, tmp_path, leaf=2)
     for target in biotac_sp.TARGETS:

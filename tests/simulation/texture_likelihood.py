@@ -24,10 +24,8 @@ from tacpipe.simulation import fingertip, forearm, slide, texture
 
 FRAMES = 400  # frames from the middle of a BioTac's slide, as classifiers read them
 STEP_M = 0.0005  # distance between two places of a track
-MIN_WAVELENGTH_M = {
-    "biotac": 0.002,
-    "roboskin": 0.0035,
-}  # wavelength that is compared; shorter ones do not pass the aperture
+# wavelength that is compared; shorter ones do not pass the aperture
+MIN_WAVELENGTH_M = {"biotac": 0.002, "roboskin": 0.0035}
 MAX_WAVELENGTH_M = 0.020  # longer ones went with the levels
 MIN_WEIGHT = 0.02  # fraction of the largest weight of a place; places with less do not count
 GAINS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4)

@@ -51,9 +51,8 @@ def test_of_a_larger_grid_the_part_next_to_the_centre_is_taken() -> None:
 def test_displacements_up_to_half_the_pitch_have_errors_below_a_fifth_of_a_pixel() -> None:
     places = gels.places(7, 9)
     grid = grid_of(grey(places))
-    numbers = np.linalg.norm(grid.positions_px[:, None] - places, axis=2).argmin(
-        axis=1
-    )  # drawn marker of each tracked one
+    # drawn marker of each tracked one
+    numbers = np.linalg.norm(grid.positions_px[:, None] - places, axis=2).argmin(axis=1)
     tracker = MarkerTracker(grid, grey(places))
     largest = 0.0
     for frame, depth in enumerate([*np.linspace(0, 1, 12), *np.linspace(1, 0, 6)]):

@@ -74,9 +74,8 @@ NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "dist
 _MAX_BATCH = 50  # tasks per Dask task, which spreads its overhead of 1.6 ms
 _CONNECT_S = 10
 _POLL_S = 1.0
-_abandoned: list[
-    contextlib.ExitStack
-] = []  # clusters of an interrupted command, referenced so that nothing closes them
+# clusters of an interrupted command, referenced so that nothing closes them
+_abandoned: list[contextlib.ExitStack] = []
 
 
 @contextlib.contextmanager

@@ -29,11 +29,8 @@ if TYPE_CHECKING:
 JOBS = 4  # number of jobs without --jobs
 CORES, MEMORY = 1, "4 GiB"  # resources of a job that Dask's configuration does not set
 SECTION = "jobqueue.slurm"
-_THREADS = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-)  # set to 1 in Dask's workers unless configured
+# set to 1 in Dask's workers unless configured
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _POLL_S = 0.5
 _SHOWN_S = 5.0  # a longer wait is reported
 

@@ -205,9 +205,8 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
     parts: list[StreamArrays] = []
     scalars: list[ArrayDescription] = []
     skipped: dict[str, str] = {}
-    stamps: list[
-        ArrayDescription
-    ] = []  # timestamps in parent groups, used for arrays of the same length without their own
+    # timestamps in parent groups, used for arrays of the same length without their own
+    stamps: list[ArrayDescription] = []
     for group, arrays in walk(tree, episode.group):
         inside = episode.inside(group)
         if inside.rpartition("/")[2] == NEXT:

@@ -22,13 +22,8 @@ from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, Stor
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
-BROKEN = (
-    OSError,
-    KeyError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-)  # errors that h5py raises for damaged bytes
+# errors that h5py raises for damaged bytes
+BROKEN = (OSError, KeyError, RuntimeError, ValueError, TypeError)
 ATTRIBUTE_BYTES = 1 << 27  # memory limit for reading an attribute
 MAX_COMPRESSION_RATIO = 10_000  # maximum number of bytes that one byte of the file may decompress to
 FILTERS = {  # HDF5 numbers of the accepted filters; others may need third-party plug-ins

@@ -159,9 +159,8 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
     bag_files = sorted(file for file in file_system.listed(path) if _file_ending(file) in READERS)
-    present_files = [
-        regular.inside(path, name) for name in names if name not in missing
-    ] or bag_files  # metadata.yaml may list names from before a rename
+    # metadata.yaml may list names from before a rename
+    present_files = [regular.inside(path, name) for name in names if name not in missing] or bag_files
     if unlisted := [file.name for file in bag_files if file not in present_files]:
         notes.append(
             f"{path} holds {listed(unlisted, 3)}, which its metadata.yaml does not name and which are not read."
@@ -253,9 +252,8 @@ class _BagReading:
     notes: list[str] = field(default_factory=list)
     spill: Spill = field(default_factory=Spill)  # decoded messages
     undescribed: int = 0  # number of messages in channels without a description
-    _described: dict[tuple[int, int], TopicConnection] = field(
-        default_factory=dict
-    )  # channel by file number and channel number
+    # channel by file number and channel number
+    _described: dict[tuple[int, int], TopicConnection] = field(default_factory=dict)
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # topic by file number and channel number
 
     def add_records(self, records: Iterator[Record], file: int, max_messages: int | None) -> None:

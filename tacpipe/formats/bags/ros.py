@@ -77,9 +77,8 @@ class RosDecoder:
     types: Types
     cdr: bool
     _meaning: meanings.Meaning | None = None
-    _shapes: dict[bytes, list[MessageShape]] = field(
-        default_factory=dict
-    )  # shapes by the first two bytes, which state the byte order
+    # shapes by the first two bytes, which state the byte order
+    _shapes: dict[bytes, list[MessageShape]] = field(default_factory=dict)
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages, grouped by shape. Raises `TopicError` if they do not match the type."""
@@ -99,9 +98,8 @@ class RosDecoder:
                     chosen_messages, self.types, self.name, encoding, known_shapes
                 ):
                     if len(rows) == 1:
-                        own_shape = replace(
-                            shape, first=matrix[0].tobytes()
-                        )  # the shape may come from an earlier message
+                        # the shape may come from an earlier message
+                        own_shape = replace(shape, first=matrix[0].tobytes())
                         self._take(own_shape, int(chosen[rows[0]]), meaning, single)
                         continue
                     for same, message in _split_by_keys(shape, matrix, meaning):

@@ -24,9 +24,8 @@ from tacpipe.plugins.stage import Values
 from tacpipe.printable import plain
 
 LOG, HEADER, PUBLISH, FRAME = "t_log_ns", "t_header_ns", "t_publish_ns", "frame_id"
-MAX_STAMP_OFFSET_NS = (
-    60 * 10**9
-)  # maximum difference between a header stamp and its log time if both use the same clock
+# maximum difference between a header stamp and its log time if both use the same clock
+MAX_STAMP_OFFSET_NS = 60 * 10**9
 ABOUT_TIME = {"unit": "ns", "quantity": "time"}
 
 

@@ -27,13 +27,8 @@ DATA_PATHS = {  # default path patterns of the frames by version
     "v2": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
-LOCATION_PREFIXES = (
-    "stats/",
-    "data/",
-    "videos/",
-    "meta/",
-    "dataset_",
-)  # prefixes of columns of meta/episodes that locate files
+# prefixes of columns of meta/episodes that locate files
+LOCATION_PREFIXES = ("stats/", "data/", "videos/", "meta/", "dataset_")
 NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with an episode's original name and attributes
 ABOUT = "meta/tacpipe.json"  # name, unit and quantity of each value of a feature, in exported datasets
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces are literal
@@ -75,9 +70,8 @@ class EpisodeDescription:
     videos: Mapping[str, str] = field(default_factory=dict)  # path in the dataset by feature
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     original: Mapping[str, Attribute] | None = None
-    video_starts_s: Mapping[str, float] = field(
-        default_factory=dict
-    )  # start time in the video by feature, 0 if missing
+    # start time in the video by feature, 0 if missing
+    video_starts_s: Mapping[str, float] = field(default_factory=dict)
 
 
 class InfoFile(TypedDict, total=False):

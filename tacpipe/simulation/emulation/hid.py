@@ -19,9 +19,8 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults, hid_server
 
 SYSTEM_PYTHON = "/usr/bin/python3"
-RAW = (
-    "06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0"  # 64 bytes in and out, like Teensy's RawHID
-)
+# 64 bytes in and out, like Teensy's RawHID
+RAW = "06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0"
 SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in report 3, like a SpaceMouse
     "0501 0908 a101 a100 8501 16a2fe 265e01 7510 9506 0930 0931 0932 0933 0934 0935 8102 c0 "
     "a100 8502 16a2fe 265e01 7510 9503 0933 0934 0935 8102 c0 a102 8503 0509 1901 2920 1500 2501 7501 9520 8102 c0 c0"

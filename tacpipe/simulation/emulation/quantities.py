@@ -270,17 +270,8 @@ FULL = {  # full range in SI units of devices that send counts
 SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities that taxels share
 NOISE = 0.002  # standard deviation as a fraction of the full range
 TARGETS = ("target_position", "target_orientation")  # values that a controller computes exactly
-SILENT = (
-    "time",
-    "status",
-    "sequence",
-    "label",
-    "mask",
-    "orientation",
-    "mass",
-    "friction",
-    *TARGETS,
-)  # quantities without noise
+# quantities without noise
+SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction", *TARGETS)
 
 
 def to_device_units(
@@ -300,9 +291,8 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
     scale = unit_scale(metadata_of(field, "unit") or "1")
     if scale is None and quantity in FULL:
         full_scale = COUNTS.get(kind.name, FLOAT_COUNTS)
-        offset = (
-            full_scale if kind.kind == "u" and axis_of(field) in ("x", "y") else 0.0
-        )  # signed values in an unsigned type
+        # signed values in an unsigned type
+        offset = full_scale if kind.kind == "u" and axis_of(field) in ("x", "y") else 0.0
         values = offset + values * (full_scale / full)
     else:
         values = values * (scale or 1.0)

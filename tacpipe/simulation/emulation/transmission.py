@@ -98,9 +98,8 @@ class Transmission:
         patient: bool = False,  # wait, instead of losing bytes, while a host's buffer is full
     ) -> None:
         self._patient = patient
-        self._unsent: deque[tuple[SentItem | None, bytes]] = (
-            deque()
-        )  # items, or None for replies, and their unsent bytes
+        # items, or None for replies, and their unsent bytes
+        self._unsent: deque[tuple[SentItem | None, bytes]] = deque()
         self._unsent_peer: Peer | None = None  # the host of the unsent items
         self._retry_ns = 0
         self.endpoint, self.sensor, self.ledger = endpoint, sensor, ledger

@@ -109,11 +109,8 @@ def _interpolate(t_ns: Times, waypoint_ns: Times, values: Floats) -> Floats:
 TRIAL_S, RETURN_S = 10.5, 1.5  # duration of a cycle
 RELEASE_S = 0.3  # duration of the opening of the fingers, at the start of the return
 CYCLE_NS = round((TRIAL_S + RETURN_S) * 1e9)
-BASE_M = (
-    0.12,
-    0.0,
-    0.0,
-)  # offset of the arm's base from that of the published rig, so that all hand positions are within reach
+# offset of the arm's base from that of the published rig, so that all hand positions are within reach
+BASE_M = (0.12, 0.0, 0.0)
 CYCLES = 4  # number of cached cycles; streams are never further apart
 
 

@@ -143,10 +143,8 @@ def _lowest_level(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: i
     if not free.any():
         return float("inf")
     levels = np.unique(deviation[free])
-    low, high = (
-        0,
-        len(levels) - 1,
-    )  # the highest level is never exceeded, and a value above one level is above all lower ones
+    # the highest level is never exceeded, and a value above one level is above all lower ones
+    low, high = 0, len(levels) - 1
     while low < high:
         middle = (low + high) // 2
         if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:

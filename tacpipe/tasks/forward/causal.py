@@ -20,9 +20,8 @@ from tacpipe.signals.resampling import linear, slerp
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 
-JOINED = (
-    2 * 3 * kinematics.TOOL_SPREAD_M
-)  # maximum distance from the initial position of a hand that is fixed to the last link
+# maximum distance from the initial position of a hand that is fixed to the last link
+JOINED = 2 * 3 * kinematics.TOOL_SPREAD_M
 
 
 class Arm:

@@ -91,9 +91,8 @@ class QuantileSums:
         return QuantileMetrics(described, self._measures(fresh, uncertainty.percents) if fresh else {}, measures)
 
     def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
-        sums_by_unit: dict[
-            str, dict[str, Sums]
-        ] = {}  # sums by predictor, by unit of the interval (recording, or unseen object)
+        # sums by predictor, by unit of the interval (recording, or unseen object)
+        sums_by_unit: dict[str, dict[str, Sums]] = {}
         for trial in trials:
             sums, unit = self.sums[trial.name], trial.name if trial.known else str(trial.object)
             sums_by_unit[unit] = (

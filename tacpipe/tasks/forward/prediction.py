@@ -68,9 +68,8 @@ def _collect_predictions(
         starts = track.starts(forecaster.context, forecaster.horizon)
         gathered[name] = Gathered(spill, empty)
         for forecast in forecasts(forecaster, track, starts):
-            counts = (
-                forecast.count[:, columns].transpose(1, 2, 0).astype(np.float32, order="C")
-            )  # (step, channel, window)
+            # (step, channel, window)
+            counts = forecast.count[:, columns].transpose(1, 2, 0).astype(np.float32, order="C")
             bands = np.empty((len(levels), *counts.shape), np.float32)
             for first in range(0, len(forecast.count) if levels else 0, CHUNK):
                 part = slice(first, min(first + CHUNK, len(forecast.count)))

@@ -99,9 +99,8 @@ class BySituation:
     horizon: int
     channels: int
     windows: dict[str, Int64s] = field(default_factory=dict)  # number of windows by recording, (situation,)
-    absolute: dict[tuple[str, str], AnyFloats] = field(
-        default_factory=dict
-    )  # (situation, step), by recording and predictor
+    # (situation, step), by recording and predictor
+    absolute: dict[tuple[str, str], AnyFloats] = field(default_factory=dict)
 
     def count(self, recording: str, situations: Int64s) -> None:
         """Count a recording's windows by situation."""

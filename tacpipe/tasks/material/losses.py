@@ -346,9 +346,8 @@ class JointWork:
     def _evaluate_network(self, network: nn.Module, slides: ScaledSlides) -> dict[str, float]:
         labelled = (slides.classes != NONE).nonzero()[:, 0]
         if self.drop_last:
-            labelled = labelled[
-                : len(labelled) // self.pairs.batch * self.pairs.batch or None
-            ]  # fewer slides than a batch are all counted
+            # fewer slides than a batch are all counted
+            labelled = labelled[: len(labelled) // self.pairs.batch * self.pairs.batch or None]
         right = loss = reconstruction = 0.0
         for first in range(0, len(labelled), CHUNK):
             batch = labelled[first : first + CHUNK]

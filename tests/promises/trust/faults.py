@@ -162,9 +162,8 @@ def collected(tool: Tool, folder: Path) -> Cell:
     summed = lab.run(tool.words(lab, "total"))
     right = tool.values(lab, "scale") == lab.right("scale") and tool.values(lab, "total") == lab.right("total")
     lost = len(lab.computed("scale")) - before
-    knows = (
-        tool.output_folder(lab, "scale") is not None
-    )  # Some tools know what is needed; the others free what they are told to, here all.
+    # Some tools know what is needed; the others free what they are told to, here all.
+    knows = tool.output_folder(lab, "scale") is not None
     outcomes = [
         f"the collection ends with {cleaned.code}, the run with {completed.code}",
         "results of the run were removed and are made again" if lost else "nothing needed is removed",

@@ -157,12 +157,8 @@ def test_every_registered_sensor_sends_what_its_driver_reads(name: str) -> None:
 
 
 def test_the_rig_of_all_sensors_has_them_all() -> None:
-    served = set(registry.sensors()) - {
-        "lsl",
-        "live",
-        "plan",
-        "grasps",
-    }  # outlets that pylsl makes; what a live session records itself
+    # outlets that pylsl makes; what a live session records itself
+    served = set(registry.sensors()) - {"lsl", "live", "plan", "grasps"}
     assert {stream.kind for stream in ALL_SENSORS.streams.values()} == served
 
 

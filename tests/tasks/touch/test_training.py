@@ -227,9 +227,8 @@ def test_a_forest_has_the_leaves_that_err_least_on_rows_it_was_not_shown(
     files = trained(tmp_path / "a", recordings(0, 8), **TREES, leaf=0, targets="pdc_th")
     assert (tried, config(files)["members"][0]["leaves"]) == ([2, 4, 8], [4])
     del tried[:]
-    smaller = trained(
-        tmp_path / "b", recordings(0, 4), **TREES, leaf=0, targets="pdc_th"
-    )  # 8 grasps: no two leaves of 8
+    # 8 grasps: no two leaves of 8
+    smaller = trained(tmp_path / "b", recordings(0, 4), **TREES, leaf=0, targets="pdc_th")
     assert (tried, config(smaller)["members"][0]["leaves"]) == ([2, 4], [4])
     del tried[:]
     single = trained(tmp_path / "c", dataset(recording(0)), **TREES, leaf=0, targets="pdc_th")

@@ -69,9 +69,8 @@ class GridForecast:
     now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
     cause: Cause
     gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
-    quantiles: Float32s | None = (
-        None  # (horizon, channel, quantile), above rest, of those asked for; None without `count`
-    )
+    # (horizon, channel, quantile), above rest, of those asked for; None without `count`
+    quantiles: Float32s | None = None
 
 
 def _gap_ms(synchronize: Any, forecaster: Forecaster, stream: str) -> float:

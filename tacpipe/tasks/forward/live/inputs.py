@@ -78,9 +78,8 @@ class InputLayout:
     finger: Place | None
     position_m: Floats  # (3,), how many metres the unit of each coordinate is
     finger_scale_m: float
-    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(
-        default_factory=dict
-    )  # places of columns in batches, by stream
+    # places of columns in batches, by stream
+    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)
 
     @classmethod
     def for_forecaster(

@@ -229,9 +229,8 @@ def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
     result = run.details
     learned = " + ".join(f"{count}" for _, count in sorted(result.learned.items()))
     best_epochs = result.config.get("validation", {}).get("epoch", {}) if result.history else {}
-    slide_counts = dict.fromkeys(
-        best_epochs[sensor] for sensor in ordered_sensors(best_epochs)
-    )  # a single value if sensors were learned jointly
+    # a single value if sensors were learned jointly
+    slide_counts = dict.fromkeys(best_epochs[sensor] for sensor in ordered_sensors(best_epochs))
     seconds = f"{float(result.config['seconds']):,.0f}" if "seconds" in result.config else NONE
     return {
         "slides learned from": learned or NONE,
