@@ -43,12 +43,11 @@ def _label(program: typer.Typer) -> None:
         "label",
         help=SUMMARIES["label"]
         + "\n\nSets labels on the named recordings, or those of a table with one row per recording (--from, as CSV, TSV, "
-        "Parquet, JSON or YAML). An empty cell changes nothing.\n\n"
-        "Intervals such as slips are in seconds since the first sample of a recording. --interval adds one to those of the "
-        "named recordings. --intervals replaces those of the recordings in a CSV with the columns recording, interval, "
-        "from_s and to_s; a row without times states that there is none.\n\n"
-        "Example: tacpipe label data/recordings trial-003 --label material=foam\n\n"
-        "Example: tacpipe label data/recordings trial-003 --interval slip 1.2 1.5",
+        "Parquet, JSON or YAML). An empty cell changes nothing.\n\nIntervals such as slips are in seconds since the "
+        "first sample of a recording. --interval adds one to those of the named recordings. --intervals replaces those "
+        "of the recordings in a CSV with the columns recording, interval, from_s and to_s; a row without times states "
+        "that there is none.\n\nExample: tacpipe label data/recordings trial-003 --label material=foam\n\nExample: "
+        "tacpipe label data/recordings trial-003 --interval slip 1.2 1.5",
     )
     def label(
         dataset: Annotated[Path, typer.Argument(help="The recordings.")],

@@ -52,11 +52,10 @@ def add(program: typer.Typer, summary: str) -> None:
     @program.command(
         "run",
         help=f"{summary}\n\nStages run in the order of their deps and outs, in the folder of the file. A stage whose "
-        "results exist is skipped. A failed stage stops only the stages that depend on it. Commands of other programs run "
-        "in the shell, each time.\n\nWith --jobs, stages that do not depend on each other run at the same time and share "
-        "the cores. The output of a command is printed when the command ends.\n\n"
-        "Example: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\n"
-        "Example: tacpipe run dvc.yaml forward --jobs 2",
+        "results exist is skipped. A failed stage stops only the stages that depend on it. Commands of other programs "
+        "run in the shell, each time.\n\nWith --jobs, stages that do not depend on each other run at the same time and "
+        "share the cores. The output of a command is printed when the command ends.\n\nExample: tacpipe run "
+        "dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\nExample: tacpipe run dvc.yaml forward --jobs 2",
     )
     def run(
         file: Annotated[Path, typer.Argument(help="A file with stages, such as dvc.yaml of DVC.")],

@@ -133,9 +133,8 @@ def check_levels(percents: tuple[int, ...]) -> None:
     if ordered != percents or ordered != mirrored or 50 not in ordered or len(ordered) < 3 or ordered[0] < 1:
         listed_percents = ",".join(map(str, percents))
         raise TacpipeError(
-            f"The quantiles {listed_percents} are not levels symmetric about 50. Give percentages "
-            f"from 1 to 99 in "
-            f"ascending order with 50 in the middle, as 10,50,90."
+            f"The quantiles {listed_percents} are not levels symmetric about 50. Give percentages from 1 to 99 in "
+            "ascending order with 50 in the middle, as 10,50,90."
         )
 
 
@@ -277,9 +276,8 @@ def promised_quantile(scores: AnyFloats, groups: Ints, level: float, noun: str) 
         count = len(np.unique(groups))
         raise TacpipeError(
             f"{count} calibration {noun} can guarantee a band with a coverage of "
-            f"{100 * highest_promised_level(count):.0f} % at most, not "
-            f"{100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, or leave "
-            f"out --promise."
+            f"{100 * highest_promised_level(count):.0f} % at most, not {100 * level:.0f} %. Split with more of them "
+            "(`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
         )
     return bound
 
