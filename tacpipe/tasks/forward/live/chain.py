@@ -128,9 +128,8 @@ class LiveChain:
         self._targets = targets
         # Channels of streams of frames, by stream. None without the first frame of the session, to which they refer.
         self._cameras = dict(cameras or {})
-        self._quantiles = (
-            forecaster.quantiles_of(quantiles)[1] if quantiles else []
-        )  # places of the quantiles in a band
+        # places of the quantiles in a band
+        self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
