@@ -56,7 +56,7 @@ def likelihood_materials(seed: int, indices: Sequence[int], rig: slide.SlideRig)
 def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
     """Return Whittle's log-likelihood of each material for trial ``index`` (material,), but for a constant."""
     sensor = slide.slide_trial(index, rig).sensor
-    track = _felt_track(seed, index, rig)
+    track = _slide_track(seed, index, rig)
     size = 2 * len(track.taper)
     number = np.fft.rfftfreq(size, STEP_M)
     compared = (number >= 1 / MAX_WAVELENGTH_M) & (number <= 1 / MIN_WAVELENGTH_M[sensor])
@@ -74,7 +74,7 @@ def log_likelihoods(seed: int, index: int, rig: slide.SlideRig) -> Floats:
     return np.array(likelihoods)
 
 
-def _felt_track(seed: int, index: int, rig: slide.SlideRig) -> SlideTrack:
+def _slide_track(seed: int, index: int, rig: slide.SlideRig) -> SlideTrack:
     """Return the track of trial ``index``: what each channel measured, less its mean, put together where it was measured."""
     scene = slide.perform(seed, index, rig)
     sensor = scene.trial.sensor
