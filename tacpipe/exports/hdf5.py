@@ -40,7 +40,10 @@ DEMOS = "demos.hdf5"
 MASKS = {"train": "train", "val": "valid", "test": "test"}  # robomimic's name by role
 EXTRA = "tacpipe"  # group of a demonstration with data that policies must not read
 VERSION = ("v110", "v110")  # HDF5 of 2016, which stores many small columns in half the space of older versions
-IMAGES = "images"  # dataset of decoded frames
+IMAGES, DERIVED = (
+    "images",
+    "derived_from",
+)  # dataset of decoded frames, and its attribute with the column they come from
 CHUNK_ROWS = 1 << 16
 LEVEL = 4  # gzip level; higher levels take twice the time for 1 %
 _STREAMS = f"""
@@ -95,7 +98,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
     return frames.synchronize_stage(params.rate_hz, params.master)
 
 
-@stage(version=2, reads=ALL)
+@stage(version=3, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the file of one recording, or no file if all recordings are in one."""
     if params.structure == "robomimic":
@@ -109,7 +112,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copy_to_sink(content)})
 
 
-@stage(version=2, part=part, first=first)
+@stage(version=3, part=part, first=first)
 def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, split: Roles | None = None) -> Result:
     """Write recordings as HDF5 files.
 
@@ -169,7 +172,7 @@ def _recording(params: Params, recording: Recording, losses: list[Loss], columns
 def _images(group: h5py.Group, columns: Columns) -> None:
     """Write the decoded frames of a stream of frames, one chunk per frame; rows without a frame are black."""
     from tacpipe.video.decoding import decode_frames, read_batches
-    from tacpipe.video.stream import read_format
+    from tacpipe.video.stream import PACKET, read_format
 
     video_format = read_format(columns)
     if video_format is None or not columns.num_rows:
@@ -178,6 +181,7 @@ def _images(group: h5py.Group, columns: Columns) -> None:
     dataset = group.create_dataset(
         IMAGES, shape, "u1", chunks=(1, *shape[1:]), compression="gzip", compression_opts=LEVEL, shuffle=True
     )
+    dataset.attrs[DERIVED] = PACKET  # `tacpipe ingest hdf5` reads the packets, and no second stream
     for row, image in decode_frames(video_format, read_batches(columns)):
         dataset[row] = image
 

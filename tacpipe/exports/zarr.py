@@ -12,12 +12,15 @@ import functools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents
+from tacpipe.exports.contents import Loss
 from tacpipe.exports.files import README_NAME, Content, Files, Scratch, loss_notes, readme_text
+from tacpipe.exports.lerobot_videos import EpisodeVideo, find_cameras
 from tacpipe.plugins.constraints import Rate
+from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
@@ -54,6 +57,8 @@ class Params:
     master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
     common: bool = False  # leave out columns that not all recordings have
+    # decode the frames of cameras into arrays STREAM_rgb (frame, row, column, rgb), the nearest in time to each row
+    images: bool = added(False)
 
 
 def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
@@ -86,7 +91,14 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     all_recordings = list(recordings)
     rate_hz = frames.common_rate_hz(all_recordings)
     columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
-    described = frames.add_frame_losses(described, recordings, originals)
+    cameras, losses = find_cameras(originals) if params.images else ([], [])
+    described = frames.add_frame_losses(described, recordings, originals, videos=[camera.stream for camera in cameras])
+    losses += [
+        (recording.name, Loss("packets: an array has the decoded frame nearest to each row", camera.stream))
+        for recording in recordings
+        for camera in cameras
+    ]
+    described = replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
     frame_arrays = frames.arrays_of_frames(
         frames.synchronized_columns(all_recordings[0]).select(columns), params.actions
     )
@@ -102,15 +114,29 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
         attributes = {"columns": array.columns, "units": array.units}
         shape = array.shape(sum(lengths))
         writers.append(_ArrayWriter(f"data/{array.name}", shape, np.result_type(*array_types), attributes, chunks))
+    image_writers = [
+        _ArrayWriter(
+            f"data/{camera.stream}_rgb",
+            (sum(lengths), camera.height_px, camera.width_px, 3),
+            np.dtype(np.uint8),
+            {"columns": ["red", "green", "blue"]},
+            chunks,
+        )
+        for camera in cameras
+    ]
     for recording in all_recordings:
         table = frames.synchronized_columns(recording).select(columns)
+        for camera, writer in zip(cameras, image_writers, strict=True):
+            original, grid = originals[recording.name], frames.synchronized_columns(recording)
+            for image in EpisodeVideo.from_recordings(camera, original, grid, "h264", rate_hz).images():
+                writer.append(image[None])
         for array, writer in zip(frame_arrays, writers, strict=True):
             for values in array.blocks(table, writer.kind):
                 writer.append(values)
     ends = _ArrayWriter(ENDS, (len(lengths),), np.dtype(np.int64), {}, chunks)
     ends.append(np.cumsum(lengths, dtype=np.int64))
     files: dict[str, Content] = {}
-    for writer in (*writers, ends):
+    for writer in (*writers, *image_writers, ends):
         files |= writer.files()
     names = [recording.name for recording in all_recordings]
     files |= {".zgroup": _GROUP, "data/.zgroup": _GROUP, "meta/.zgroup": _GROUP}

@@ -10,6 +10,7 @@ import av
 import h5py
 import numpy as np
 import pytest
+import zarr
 
 import tacpipe
 from tacpipe.arrays import Bytes
@@ -158,3 +159,30 @@ def test_a_row_of_a_lerobot_dataset_has_the_nearest_frame(lab: Lab, monkeypatch:
     rows = [round(number * 2.5 - 1e-9) for number in range(len(images))]
     assert len(images) == 16
     assert np.abs(images - np.array(videos.decoded(path), int)[rows]).mean() < 4
+
+
+def test_decoded_frames_in_an_hdf5_file_are_no_second_stream(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(lab, "mpeg4", "avi", monkeypatch, b_frames=0)
+    lab.run("export hdf5 rec -o h5 --images")
+    lab.run("ingest hdf5 h5 -o back")
+    original, back = (tacpipe.open(name)["a"] for name in ("rec", "back"))
+    assert back.streams == original.streams
+    assert back.table("gel").column("packet").to_pylist() == original.table("gel").column("packet").to_pylist()
+
+
+@pytest.mark.parametrize("rate_hz", [25, 10])
+def test_zarr_arrays_have_the_nearest_frame_of_each_row(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, rate_hz: int
+) -> None:
+    path = write(lab, "mpeg4", "avi", monkeypatch, b_frames=2)
+    lab.run(f"export zarr rec -o zarr --rate-hz {rate_hz} --master gel --images")
+    store: Any = zarr.open("zarr/replay.zarr", mode="r")
+    images = store["data/gel_rgb"][:]
+    rows = [round(number * 25 / rate_hz - 1e-9) for number in range(len(images))]
+    assert len(images) == COUNT * rate_hz // 25
+    assert np.array_equal(images, np.array(videos.decoded(path))[rows])
+    if rate_hz == 25:
+        lab.run("ingest zarr zarr/replay.zarr -o back")
+        (back,) = tacpipe.open("back")
+        table = back.table("gel_rgb")
+        assert table.column("packet").to_pylist() == [image.tobytes() for image in images]
