@@ -36,11 +36,14 @@ COMMANDS = (
     "split data/slides -o data/slides-split --stratify sensor,material",
     "train material data/slides --split data/slides-split -o models/material",
     "evaluate models/material data/slides -o results/material",
+    "simulate gel --trials 2 -o data/gels",
+    "extract markers data/gels --rows 7 --columns 9 -o data/markers",
 )
 PICTURES = {  # picture -> command of the viewer, and the time at the cursor (s)
     "view-forward": ("view data/slips trial-00[0-4]", 5.1),
     "view-forecast": ("view data/slips trial-000 --predictions data/predictions", 1.4),
     "view-material": ("view data/slides trial-001 --predictions results/material", 0.9),
+    "view-gel": ("view data/markers trial-000 --video data/gels", 3.2),
     "view-touch": ("view data/pinched trial-000 --predictions data/touched", None),
 }
 

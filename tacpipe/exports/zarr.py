@@ -44,6 +44,8 @@ store = zarr.open("EXPORT/{STORE}", mode="r")
 touch, ends = store["data/STREAM_tactile"], store["{ENDS}"]
 ```
 
+With `--images`, `data/STREAM_rgb` has the frame of a camera nearest to each row (frame, row, column, rgb).
+
 The attribute `columns` of an array names its channels, `units` their units. The attributes of the group `meta` hold the
 rate, the name of each recording and its labels.
 """

@@ -354,7 +354,8 @@ def _space_views(contents: DrawnContents) -> tuple[Any, float]:
         rrb.Spatial2DView(origin=_origin(stream.CAMERAS, camera.stream), name=camera.stream)
         for camera in contents.frames
     ]
-    views += [rrb.Horizontal(*cameras, name="Cameras")] if len(cameras) > 1 else cameras
+    tabs = [rrb.Horizontal(*cameras, name="Cameras")] if len(cameras) > 1 else cameras
+    views = [*tabs, *views] if contents.markers else [*views, *tabs]  # the first tab is shown
     views.append(rrb.TextDocumentView(origin=stream.ABOUT, name="About"))
     return (rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0]), 4.0 if contents.markers else 2.4
 
