@@ -254,3 +254,18 @@ def run_python(
     """Run Python with these arguments in a process of its own, and keep what it prints."""
     command, variables = [sys.executable, *arguments], {**os.environ, **(environment or {})}
     return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=check)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty store in a folder."""
+    prepared = Store(tmp_path / ".tacpipe")
+    prepared.prepare()
+    return prepared
+
+
+@pytest.fixture
+def toys(lab: Lab) -> Lab:
+    """A project with three recordings of the toy simulation."""
+    lab.run("simulate toy --trials 3 --rows 5 -o data/r")
+    return lab

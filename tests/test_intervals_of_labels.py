@@ -28,12 +28,6 @@ def test_a_text_reads_back_as_the_union_of_its_intervals(times: list[tuple[float
     assert all(first[1] < second[0] for first, second in itertools.pairwise(again))
 
 
-@pytest.fixture
-def toys(lab: Lab) -> Lab:
-    lab.run("simulate toy --trials 3 --rows 5 -o data/r")
-    return lab
-
-
 def labels(lab: Lab) -> dict[str, Any]:
     recordings = lab.manifest("data/r").recordings
     return {name: entry["attributes"].get("slip_intervals") for name, entry in recordings.items()}

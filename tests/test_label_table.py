@@ -32,12 +32,6 @@ WANTED: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture
-def toys(lab: Lab) -> Lab:
-    lab.run("simulate toy --trials 3 --rows 5 -o data/r")
-    return lab
-
-
 def labels(lab: Lab) -> dict[str, dict[str, Any]]:
     attributes = {name: dict(entry["attributes"]) for name, entry in lab.manifest("data/r").recordings.items()}
     return {name: {key: values[key] for key in values if key != "trial"} for name, values in attributes.items()}

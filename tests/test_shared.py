@@ -1,20 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from tacpipe.engine.execution import SharedFiles
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import Draft
 from tacpipe.store.store import Store
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    prepared = Store(tmp_path / ".tacpipe")
-    prepared.prepare()
-    return prepared
 
 
 class Made:

@@ -22,13 +22,6 @@ IDENTITY: StageIdentity = {"stage": "scale", "version": 1, "params": {}, "inputs
 EMPTY: StoredResult = {"recordings": {}, "files": {}}
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    prepared = Store(tmp_path / ".tacpipe")
-    prepared.prepare()
-    return prepared
-
-
 def test_what_is_put_comes_back_and_lies_under_its_digest_read_only(store: Store) -> None:
     stored = store.put(b"touch")
     path = Path(store.object_path(stored.digest))

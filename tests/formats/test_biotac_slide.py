@@ -14,6 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats.biotac_slide import biotac_slide, discover
 from tacpipe.formats.published import Params
 from tacpipe.plugins.stage import RecordingOutput
+from tests.formats.builders import edit
 from tests.formats.slide_files import SECOND, write_biotac
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -25,12 +26,6 @@ def read(source: Path, params: Params | None = None) -> RecordingOutput:
     recording = biotac_slide(params, files)
     assert isinstance(recording, RecordingOutput)
     return recording
-
-
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
 
 
 def values(table: pa.Table) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from tacpipe.formats.table import contained, layout, recordings
 from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats import fake_container
+from tests.formats.builders import layout_params
 
 COMMAND = ContainerCommand("xdf")
 NONE = Params()
@@ -36,10 +36,6 @@ def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
         name: COMMAND.read(params, value.files, value.values)
         for name, value in COMMAND.discover(params, folder).items()
     }
-
-
-def layout_params(text: str) -> Params:
-    return Params(json.dumps(tomllib.loads(text)))
 
 
 def test_without_a_layout_streams_are_as_their_file_declares_them(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from tacpipe.formats.xela_flat import discover, xela_flat
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.signals.kinematics import PANDA, rotates_with_hand
 from tests.formats import xela_files
+from tests.formats.builders import edit
 from tests.signals.test_kinematics import elementary
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -29,12 +30,6 @@ def read(folder: Path, params: Params | None = None) -> RecordingOutput:
     recording = xela_flat(params, files)
     assert isinstance(recording, RecordingOutput)
     return recording
-
-
-def edit(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
 
 
 def drop_rows(path: Path, count: int) -> None:

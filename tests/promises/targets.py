@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import json
+import os
 import re
 import shutil
 import sqlite3
@@ -397,3 +398,13 @@ def ingest(lab: Lab, name: str) -> Ran:
 
 def _trees(name: str) -> list[bytes]:
     return [bytes([number]) + path.read_bytes() for number, path in enumerate(tree(name)[1])]
+
+
+class Opened:
+    """A pickle of this leaves a folder behind when it is opened."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (os.mkdir, (str(self.trace),))

@@ -288,26 +288,16 @@ def test_arrays_whose_heads_lie_are_refused(
     assert not (tmp_path / "opened").exists()
 
 
-class Opened:
-    """A pickle of this leaves a file behind when it is opened."""
-
-    def __init__(self, trace: Path) -> None:
-        self.trace = trace
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (os.mkdir, (str(self.trace),))
-
-
 @pytest.mark.parametrize("name", ["icub_fold_0.npy", "labels_fold_0.npy"])
 @pytest.mark.parametrize("form", ["bare", "as an array of objects"])
 def test_a_pickle_in_place_of_an_array_is_never_opened(tmp_path: Path, name: str, form: str) -> None:
     targets.TREES["roboskin"](tmp_path)
     trace = tmp_path / "opened"
     if form == "bare":
-        (tmp_path / name).write_bytes(pickle.dumps(Opened(trace)))
+        (tmp_path / name).write_bytes(pickle.dumps(targets.Opened(trace)))
     else:
         value = np.empty(1, dtype=object)
-        value[0] = Opened(trace)
+        value[0] = targets.Opened(trace)
         np.save(tmp_path / name, value, allow_pickle=True)
     check_refusal(lambda: targets.ingest_recordings("roboskin", tmp_path), name)
     assert not trace.exists()

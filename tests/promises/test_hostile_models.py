@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import pickle
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +26,7 @@ from tests.fake_recordings import FakeDataset
 from tests.promises.counts import count
 from tests.promises.limits import GIB, bound_memory, is_sentence, sample_cases
 from tests.promises.mutations import mutate
+from tests.promises.targets import Opened
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
@@ -347,16 +347,6 @@ def test_a_forest_as_it_was_grown_is_one() -> None:
 
 
 # ---- as commands
-
-
-class Opened:
-    """A pickle of this leaves a folder behind when it is opened."""
-
-    def __init__(self, trace: Path) -> None:
-        self.trace = trace
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (os.mkdir, (str(self.trace),))
 
 
 EVIL = (

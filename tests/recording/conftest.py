@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.recording import patient
+from tacpipe.simulation.emulation.emulator import Emulator
+from tests.conftest import Lab
+from tests.recording import force_rig, live, patient
+from tests.recording.scripted import Script
 
 SERVED = {"acquired", "rig", "served"}  # fixtures that emulate devices
 
@@ -24,3 +28,15 @@ def patience(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     """Have devices that are emulated in real time awaited for as long as it takes."""
     if request.node.get_closest_marker("rig"):
         patient.relax(monkeypatch)
+
+
+@pytest.fixture
+def rig(lab: Lab) -> Iterator[Emulator]:
+    with live.served(lab.folder, live.FORCE) as emulator:
+        yield emulator
+
+
+@pytest.fixture
+def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
+    """A rig whose force sensor sends for 20 s."""
+    return force_rig.sending(lab, monkeypatch, 20)

@@ -14,17 +14,11 @@ import pytest
 from tacpipe.recording import appending
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tests.conftest import Lab
-from tests.recording import force_rig, live
+from tests.recording import live
 from tests.recording.scripted import Script
 from tests.recording.test_recovering import spooled
 from tests.recording.test_schedule import FORCE, RATE_HZ, counts
 from tests.test_garbage import age
-
-
-@pytest.fixture
-def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
-    """A rig whose force sensor sends for 20 s."""
-    return force_rig.sending(lab, monkeypatch, 20)
 
 
 def described(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:

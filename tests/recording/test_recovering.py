@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +30,6 @@ from tests.recording.test_reading import SENSOR, frames
 
 RIG = live.stream("force", "optoforce", "serial:/dev/there-is-none", "{ axes = 3 }")
 PERIOD_NS = 1_000_000
-
-
-@pytest.fixture
-def rig(lab: Lab) -> Iterator[Emulator]:
-    with live.served(lab.folder, live.FORCE) as emulator:
-        yield emulator
 
 
 def spooled(lab: Lab, name: str = "one", text: str = RIG, unread: int = 0, count: int = 100) -> Path:

@@ -22,7 +22,7 @@ from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.station import READ_S, Station
 from tacpipe.sensors.sensor import LocalAddress
 from tests.conftest import Lab
-from tests.recording import force_rig, live
+from tests.recording import live
 from tests.recording.scripted import Script
 from tests.recording.test_reading import frames
 from tests.recording.test_schedule import RATE_HZ, counts
@@ -200,12 +200,6 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
     assert float(made_of.attributes["pad_clock_residual_ms"]) < 0.1
     assert abs(float(made_of.attributes["pad_clock_drift_ppm"])) < 1
     assert not [name for name in made_of.streams[""].column_names if "uncertain" in name]
-
-
-@pytest.fixture
-def script(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Script:
-    """A rig whose force sensor sends for 20 s."""
-    return force_rig.sending(lab, monkeypatch, 20)
 
 
 def slow_to_finish(script: Script, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ import struct
 import subprocess
 import termios
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -21,12 +20,6 @@ from tests.conftest import Lab
 from tests.recording import live
 
 REST, TOUCHED = 100, 1000  # counts
-
-
-@pytest.fixture
-def rig(lab: Lab) -> Iterator[Emulator]:
-    with live.served(lab.folder, live.FORCE) as emulator:
-        yield emulator
 
 
 class Pad(threading.Thread):

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.stores import azurite, places
+from tests.stores import azurite, places, proxy
 from tests.stores.places import Place
+from tests.stores.proxy import Proxy
 
 AZURE = "azurite"
 EVERY = [*places.IN_THIS_PROCESS, *(pytest.param(name, marks=pytest.mark.long) for name in (places.SERVER, AZURE))]
@@ -67,3 +68,11 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
         for name, value in places.environment(request.getfixturevalue("seaweedfs")).items():
             monkeypatch.setenv(name, value)
     return places.bucket(f"s3://lab/{uuid.uuid4().hex}/store")
+
+
+@pytest.fixture
+def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """A proxy before the server that the environment names."""
+    with proxy.between(localbucket) as running_proxy:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.endpoint)
+        yield running_proxy

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from tacpipe.store.cached import CachedStore
 from tacpipe.store.remote import RemoteStore
 from tests.conftest import Lab, Ran
 from tests.promises.counts import count
-from tests.stores import places, proxy
+from tests.stores import places
 from tests.stores.places import KEY, SECRET, Place
 from tests.stores.proxy import FAULTS, Proxy
 from tests.stores.stepping import Stepping
@@ -448,14 +448,6 @@ class Linked:
         ran = self.computers.lab.call(command)
         self.faulty.fault = lambda number: None
         return ran
-
-
-@pytest.fixture
-def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
-    """A proxy before the server that the environment names."""
-    with proxy.between(localbucket) as running_proxy:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.endpoint)
-        yield running_proxy
 
 
 @pytest.fixture

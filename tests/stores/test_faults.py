@@ -3,7 +3,7 @@
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ from tacpipe.store import bucket
 from tacpipe.store.store import Store
 from tests.conftest import Lab, Ran, without_created_store
 from tests.promises.counts import count
-from tests.stores import places, proxy
+from tests.stores import places
 from tests.stores.places import SECRET, Place
 from tests.stores.proxy import FAULTS, WRONG_ANSWERS, Proxy
 
@@ -28,14 +28,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Retries follow soon."""
     monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
     monkeypatch.setattr(bucket, "RETRIES", 0)
-
-
-@pytest.fixture
-def faulty(localbucket: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
-    """A proxy before the server that the environment names."""
-    with proxy.between(localbucket) as running_proxy:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", running_proxy.endpoint)
-        yield running_proxy
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from pathlib import Path
 
 import h5py
@@ -19,23 +17,16 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.arrays import files
+from tests.formats.builders import about, layout_params
 
 NONE = Params()
 HDF5 = ContainerCommand("hdf5")
 hdf5 = registry.load("ingest.hdf5")
 
 
-def layout_params(text: str) -> Params:
-    return Params(json.dumps(tomllib.loads(text)))
-
-
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
     sources = HDF5.discover(params, folder)
     return {name: hdf5(params, value.files, value.values) for name, value in sources.items()}
-
-
-def about(table: pa.Table, column: str) -> dict[str, str]:
-    return {key.decode(): value.decode() for key, value in (table.schema.field(column).metadata or {}).items()}
 
 
 def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_controller(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.video import decoding, stream
 from tests.conftest import Lab
+from tests.formats.builders import about, layout_params
 from tests.formats.lerobot import files
 from tests.video import videos
 
@@ -31,18 +31,10 @@ lerobot = registry.load("ingest.lerobot")
 EPISODE = "pick-episode_00000{}"
 
 
-def layout_params(text: str) -> Params:
-    return Params(json.dumps(tomllib.loads(text)))
-
-
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
     return {
         name: lerobot(params, value.files, value.values) for name, value in LEROBOT.discover(params, folder).items()
     }
-
-
-def about(table: pa.Table, column: str) -> dict[str, str]:
-    return {key.decode(): value.decode() for key, value in (table.schema.field(column).metadata or {}).items()}
 
 
 @pytest.mark.parametrize("write", [files.write_v2, files.write_v3])
