@@ -147,9 +147,9 @@ class ForwardReport(TaskReport):
         return [
             f"Settings: {settings}." if settings else "",
             *_look_ahead_notes(context),
-            "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, as the "
-            "geometric mean of the ratios over recordings. All predictions are decoded to the unit of the channels before the "
-            "evaluation, so all rows can be compared. Errors without a step are means over all steps.",
+            "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, as "
+            "the geometric mean of the ratios over recordings. All predictions are decoded to the unit of the channels "
+            "before the evaluation, so all rows can be compared. Errors without a step are means over all steps.",
             f"In the first run, {effective[0]}." if effective else "",
             mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
             "The plan is the recorded motion, so errors of methods that read it are valid for an arm that follows its plan "
