@@ -10,6 +10,7 @@ from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.settings import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.slip.model import SlipModel
@@ -91,3 +92,10 @@ class SlipTask(Task):
         from tacpipe.tasks.slip.model import calibrate
 
         return Calibration("probabilities", calibrate)
+
+    @property
+    def live(self) -> LiveTask:
+        """Probability and alarm at each sample."""
+        from tacpipe.tasks.slip.live.task import SlipLive
+
+        return SlipLive()

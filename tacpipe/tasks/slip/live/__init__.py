@@ -1,0 +1,1 @@
+"""Predict slips while the rig runs."""

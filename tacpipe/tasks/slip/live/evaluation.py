@@ -1,0 +1,120 @@
+"""Evaluate recordings of live sessions: what was published next to what `predict --causal` computes, and the latencies."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.datasets import model_files
+from tacpipe.errors import UsageError
+from tacpipe.plugins.stage import Result
+from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
+from tacpipe.tasks.slip.live.messages import SLIP
+from tacpipe.tasks.slip.model import SlipModel
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model, Recording
+
+MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
+LIMITS_MS = (10, 20)
+
+
+def evaluate(model: Model, recordings: Dataset) -> Result:
+    """Return rows, equality, latencies and, with labels of slips, leads of alarms.
+
+    Raises `UsageError` for a recording without a session, or of another model.
+    """
+    loaded = SlipModel.load(model.files)
+    live = {}
+    for name, recording in sorted(recordings.recordings.items()):
+        if SLIP not in recording.streams or "probability" not in recording.columns(SLIP).column_names:
+            raise UsageError(
+                f"{name} is not a recording of a live session with a slip model. Give what `tacpipe live -o` recorded, or "
+                f"leave --live out."
+            )
+        if recording.attributes.get(MODEL, model.digest) != model.digest:
+            raise UsageError(
+                f"The session of {name} ran another model. Give the model that it ran, or leave --live out."
+            )
+        live[name] = _session(loaded, recording)
+    totals = {key: sum(session[key] for session in live.values()) for key in ("published", "compared", "equal")}
+    notes = [
+        f"{totals['equal']} of {totals['compared']} published probabilities are what `tacpipe predict --causal` gives, bit "
+        f"for bit."
+    ]
+    metrics = {"live": {**totals, "recordings": live}}
+    return Result(
+        files={model_files.CONFIG: model.files[model_files.CONFIG], "metrics.json": model_files.to_json(metrics)},
+        notes=notes,
+    )
+
+
+def _session(model: SlipModel, recording: Recording) -> dict[str, Any]:
+    """Return the figures of one recorded session."""
+    stream, predicted = recording.table(SLIP), model.table(recording)
+    clock = "t_device_ns" if "t_device_ns" in stream.column_names else "t_ns"
+    published = {name: stream[name].to_numpy() for name in (clock, "probability", "score", "alarm")}
+    answered = np.isfinite(published["probability"])
+    times = published[clock][answered]
+    _, ours, theirs = np.intersect1d(times, predicted["t_ns"].to_numpy(), return_indices=True)
+    same = np.ones(len(ours), bool)
+    for name in ("probability", "score"):
+        sent, computed = published[name][answered][ours], predicted[name].to_numpy()[theirs]
+        same &= sent.view(np.int64) == computed.view(np.int64)
+    latency_ms = recording.table("latency")["latency_ms"].to_numpy()
+    latency_ms = latency_ms[np.isfinite(latency_ms)]
+    session: dict[str, Any] = {
+        "published": int(answered.sum()),
+        "compared": len(ours),
+        "equal": int(same.sum()),
+        "latency": _quantiles(latency_ms),
+    }
+    track = model.reader.track(recording)
+    if track.labels is not None:
+        session["alarms"] = _alarms(model, recording, times, published["alarm"][answered] > 0)
+    return session
+
+
+def _quantiles(latency_ms: Any) -> dict[str, float]:
+    """Return count, median, 99th percentile and maximum, and how many are above each limit."""
+    if not len(latency_ms):
+        return {"count": 0}
+    return {
+        "count": len(latency_ms),
+        "median_ms": round(float(np.median(latency_ms)), 3),
+        "p99_ms": round(float(np.quantile(latency_ms, 0.99)), 3),
+        "largest_ms": round(float(latency_ms.max()), 3),
+        **{f"above_{limit}_ms": int((latency_ms > limit).sum()) for limit in LIMITS_MS},
+    }
+
+
+def _alarms(model: SlipModel, recording: Recording, times: Any, on: Any) -> dict[str, Any]:
+    """Return how the published alarm did on the labelled slips."""
+    track = model.reader.track(recording)
+    states = track.states(model.horizon_ns, round(model.params.recovery_s * 1e9))
+    rows = np.clip(np.searchsorted(track.t_ns, times), 0, len(track.t_ns) - 1)
+    scored = ScoredTrack(
+        recording.name,
+        track.object,
+        times,
+        states[rows],
+        on.astype(float),
+        track.events,
+        np.ones(len(times)),
+        track.since_s[rows],
+    )
+    events: list[EventScore] = score_events(scored, 0.5, model.horizon_ns)
+    return {
+        "slips": [
+            {
+                key: round(value, 3) if value == value else None
+                for key, value in dataclasses.asdict(event).items()
+                if isinstance(value, float)
+            }
+            for event in events
+        ],
+        "false_alarms": false_alarms(scored, 0.5, model.horizon_ns),
+        "minutes": round(stable_minutes([scored]), 4),
+    }

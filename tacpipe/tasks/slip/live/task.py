@@ -1,0 +1,133 @@
+"""Run slip models live: settings, session plan and engine, and the evaluation of recorded sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
+from tacpipe.plugins.constraints import Range
+from tacpipe.printable import listed
+from tacpipe.tasks.slip.live.messages import DECLARATION, SLIP
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.plugins.stage import Result
+    from tacpipe.recording.rig import Rig
+    from tacpipe.sensors.live import Declaration
+    from tacpipe.sensors.sensor import Sensor
+    from tacpipe.tasks.slip.live.engine import SlipEngine
+    from tacpipe.tasks.task import PredictionRequest
+
+
+@dataclass(frozen=True)
+class SlipSettings(TaskSettings):
+    """Settings of a session with a slip model."""
+
+    # False alarms per minute that the alarm was set for: 0.1, 1 or 10 [1]
+    alarms_per_minute: Annotated[float, Range(above=0, maximum=60)] = 1.0
+
+
+class SlipLive(LiveTask):
+    """The probability of a slip and an alarm at each sample."""
+
+    settings: ClassVar[type[TaskSettings]] = SlipSettings
+    declaration: ClassVar[Declaration] = DECLARATION
+
+    def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
+        """Return the streams of probabilities and latencies.
+
+        Raises `TacpipeError` if the model was trained behind a stage, or does not run live; `UsageError` if the rig lacks a
+        stream of the model or the model an alarm.
+        """
+        from tacpipe.datasets import model_files
+
+        own = _own(settings)
+        config = model_files.tree(model.files, model_files.CONFIG, {"fingers": list, "calibration.levels": dict})
+        _require_recorded(model)
+        _level_name(config["calibration"]["levels"], own.alarms_per_minute)
+        for finger in config["fingers"]:
+            if finger["stream"] not in rig.streams:
+                raise UsageError(
+                    f"The model reads the stream {finger['stream']}, and the rig has {listed(rig.streams)}. Take the "
+                    f"rig that the model was trained on."
+                )
+            channels = [field.name for field in rig.streams[finger["stream"]].sensor.fields()]
+            missing = sorted(set(finger["channels"]) - set(channels))
+            if missing:
+                raise UsageError(
+                    f"The stream {finger['stream']} of this rig has no channel {missing[0]}, which the model reads. Take "
+                    f"the rig that the model was trained on."
+                )
+        return SessionPlan(rig, own, {SLIP: {}, "latency": {}}, {"live_alarms_per_minute": own.alarms_per_minute})
+
+    def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> SlipEngine:
+        """Return the engine of a session, which has scored its first window."""
+        import numpy as np
+
+        from tacpipe.tasks.slip.live.engine import SlipEngine
+        from tacpipe.tasks.slip.live.messages import SlipDescription
+        from tacpipe.tasks.slip.model import SlipModel
+
+        loaded = SlipModel.load(model.files)
+        if not loaded.scorer.runs_live:
+            raise UsageError("The rule on forecasts does not run live. Train a model with --architecture boosting.")
+        name = _level_name(loaded.calibration.levels, _own(settings).alarms_per_minute)
+        fingers = loaded.reader.fingers
+        layouts = {finger.stream: _grid(finger.layout) for finger in fingers}
+        description = SlipDescription(settings.model, loaded.config["rate_hz"], loaded.params.horizon_s, name, layouts)
+        loaded.scorer.score_window(
+            loaded.reader, [np.zeros((finger.rows, len(finger.channels))) for finger in fingers]
+        )  # imports and allocates what the first sample would wait for
+        return SlipEngine(
+            loaded,
+            {finger.stream: sensors[finger.stream] for finger in fingers},
+            description,
+            loaded.level(name),
+            settle_ns=round(settings.settle_ms * 1e6),
+        )
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return the probabilities that a session would publish for recordings."""
+        from tacpipe.tasks.slip.model import predict
+
+        _require_recorded(model)
+        return predict(model.files, recordings)
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return the evaluation of recorded sessions."""
+        from tacpipe.tasks.slip.live import evaluation
+
+        return evaluation.evaluate(model, recordings)
+
+
+def _own(settings: Settings) -> SlipSettings:
+    assert isinstance(settings.task, SlipSettings)
+    return settings.task
+
+
+def _require_recorded(model: Model) -> None:
+    """Raise `TacpipeError` if a model was trained behind a stage, whose rows a session does not have."""
+    steps = [step["stage"] for step in model.source.chain]
+    if steps:
+        raise TacpipeError(
+            f"The model was trained behind `tacpipe {steps[0].replace('.', ' ')}`, and a session reads samples as they are "
+            f"recorded. Train it on recordings, with slips labelled by `tacpipe label RECORDINGS --interval slip FROM TO`."
+        )
+
+
+def _level_name(levels: Mapping[str, float], per_minute: float) -> str:
+    """Return the name of the level for a rate of false alarms. Raises `UsageError` if the model has none."""
+    name = f"{per_minute:g}"
+    if name not in levels:
+        raise UsageError(f"The model has alarms at {', '.join(levels)} false alarms per minute. Choose one of these.")
+    return name
+
+
+def _grid(layout: tuple[Mapping[str, Any], ...]) -> list[list[int]]:
+    """Return row and column of each taxel, from 0, for drawing; a square grid where the layout does not state them."""
+    taxels = list(dict.fromkeys(place.get("taxel", str(number)) for number, place in enumerate(layout)))
+    width = max(1, round(len(taxels) ** 0.5))
+    return [[number // width, number % width] for number in range(len(taxels))]
