@@ -11,6 +11,7 @@ import os
 import socket
 import threading
 from collections.abc import Coroutine
+from pathlib import Path
 from typing import Any, cast
 from urllib.parse import parse_qs, parse_qsl, urlsplit
 
@@ -32,6 +33,15 @@ SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
 BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
 # a client may send: the first for its request, then so many a second
 RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
+# The page comes from one file, and connects to its own server only.
+PAGE_HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self' ws: wss:"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
 OPEN_S = 2.0  # limit of a handshake
 END_S = 1.0  # limit of closing all connections
 SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that goes is no error
@@ -91,8 +101,8 @@ class WebsocketPublisher:
         return await serve(
             self._subscribe,
             sock=listening,
-            origins=[None, *map(Origin, origins)],
-            process_request=self._check_token,
+            origins=[None, *map(Origin, [*own_origins(listening), *origins])],
+            process_request=self._answer,
             compression=None,
             open_timeout=OPEN_S,
             close_timeout=END_S,
@@ -109,13 +119,22 @@ class WebsocketPublisher:
         for connection in self._connections:
             connection.transport.abort()
 
-    def _check_token(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return a refusal for a client that does not send the token, as a header or in the address."""
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return a refusal for a client without the token, the page for a browser, and None for a subscriber.
+
+        The token is a header or part of the address.
+        """
         sent = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         header = request.headers.get("Authorization", f"Bearer {sent}")
-        if hmac.compare_digest(header.encode(errors="replace"), f"Bearer {self._token}".encode()) or not self._token:
+        if self._token and not hmac.compare_digest(header.encode(errors="replace"), f"Bearer {self._token}".encode()):
+            return connection.respond(401, f"Send the token of {TOKEN}.\n")
+        if "Upgrade" in request.headers:
             return None
-        return connection.respond(401, f"Send the token of {TOKEN}.\n")
+        response = connection.respond(200, page())
+        del response.headers["Content-Type"]
+        for name, value in PAGE_HEADERS.items():
+            response.headers[name] = value
+        return response
 
     async def _subscribe(self, connection: ServerConnection) -> None:
         """Send a client the description and then what is published, until it goes."""
@@ -139,6 +158,18 @@ class WebsocketPublisher:
             elif not late:
                 ready.append(connection)
         broadcast(ready, text)
+
+
+def page() -> str:
+    """Return the page that draws the messages in a browser."""
+    return (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
+
+
+def own_origins(listening: socket.socket) -> list[str]:
+    """Return where the page of a listening socket may come from: its address, and this computer by name."""
+    host, port = listening.getsockname()[:2]
+    hosts = [f"[{host}]" if ":" in host else host, "localhost", "127.0.0.1", socket.gethostname()]
+    return [f"http://{name}:{port}" for name in dict.fromkeys(hosts)]
 
 
 def _listening_socket(place: str) -> socket.socket:

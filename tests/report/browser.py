@@ -57,6 +57,11 @@ class Browser:
         self.run("document.fonts.ready.then(() => true)")
         self.run("(window.drawn ? window.drawn() : Promise.resolve()).then(() => true)")
 
+    def visit(self, address: str) -> None:
+        """Open the page at an address, and wait until it is loaded."""
+        self._call("Page.navigate", {"url": address})
+        self._wait(lambda message: message.get("method") == "Page.loadEventFired")
+
     def dark(self, is_dark: bool) -> None:
         """Show pages as those who prefer dark ones see them."""
         feature = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
