@@ -136,13 +136,16 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
     data = {"split", "train", "report", "export", "extract"}
     stage_names = {*registry.stages(), *registry.commands()} - data
     # the command line has aliases and groups of commands, an export of frames runs synchronize before it, the viewer
-    # reads the thresholds of contacts, and a live session reads the params of an earlier version of synchronize
+    # reads the thresholds of contacts and the pitch of markers, and a live session extracts channels of cameras and reads
+    # the params of an earlier version of synchronize
     needed = {
         "cli/help.py",
         "cli/main.py",
         "exports/frames.py",
+        "live/extraction.py",
         "live/stages.py",
         "viewer/contents.py",
+        "viewer/markers.py",
     }
 
     assert _modules_with(re.compile("|".join(map(re.escape, stage_names)))) == needed
