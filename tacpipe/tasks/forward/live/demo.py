@@ -1,8 +1,8 @@
-"""A live session without hardware: `make live-demo`.
+"""Run a live session without hardware: `make live-demo`.
 
-A model is trained on simulated trials whose slips the plan causes; then the first paper's rig is emulated with such trials,
-a planner sends where the hand will go, and the session runs on it. At the end stand the slips of the simulation, the alarms
-and how long before a slip they came: printed, and drawn.
+A model is trained on simulated trials in which the plan causes slip. Then the first paper's rig is emulated with such
+trials, a planner sends the future motion of the hand, and a session runs on it. Finally, the slips of the simulation,
+the alarms and their leads are printed and drawn.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.forward.slips import Leads, leads, shear
 from tacpipe.tasks.forward.slips import events as events_of
 
-GAP_PERIODS = 5.0  # periods without a forecast that break the line
-BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip that is drawn enlarged
-MAX_DRAWN_SLIPS = 6  # slips that are drawn enlarged
+GAP_PERIODS = 5.0  # periods without a forecast that interrupt the line
+BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip in the enlarged plots
+MAX_DRAWN_SLIPS = 6  # maximum number of enlarged slips
 MEASURED, PREDICTED, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
 
 
@@ -45,7 +45,7 @@ def draw(
     horizon_ns: int,
     headline: str,
 ) -> Path:
-    """Draw a session against the slips of the simulation, ``slips_ns`` (event, 2), and return the path."""
+    """Draw a session and the slips of the simulation, ``slips_ns`` (event, 2), and return the path of the picture."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -79,7 +79,7 @@ def draw(
 
 
 def lead_in_words(alarm: Any, begins_ns: int, horizon_ns: int) -> str:
-    """Return by how much the slip alarm led the slip that begins at a time, of the session's stream of alarms.
+    """Return the lead of the slip alarm, in the session's stream of alarms, over the slip that starts at a time.
 
     >>> import pandas
     >>> rows = pandas.DataFrame({"t_device_ns": [0, 20_000_000, 40_000_000], "slip_state": [0, 1, 1]})
@@ -95,7 +95,7 @@ def lead_in_words(alarm: Any, begins_ns: int, horizon_ns: int) -> str:
 
 
 def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -> None:
-    """Draw the shear load of the first skin one row ahead, and the largest that is predicted within the horizon."""
+    """Draw the shear load of the first skin one row ahead, and the maximum predicted within the horizon."""
     names = list(dict.fromkeys(name.rpartition("_t")[0] for name in table.column_names if "_taxel" in name))
     steps = sorted({int(name.rpartition("_t")[2]) for name in table.column_names if "_taxel" in name})
     t_ns = table.column("t_device_ns").to_numpy()
@@ -120,7 +120,7 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
 
 
 def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> None:
-    """Draw where alarms are on and where it slips."""
+    """Draw when alarms are on and when the object slips."""
     for place, name in enumerate(("load", "slip")):
         state = alarm[f"{name}_state"].to_numpy()
         for value, colour in ((0, QUIET), (1, PREDICTED)):
@@ -149,17 +149,21 @@ def _draw_slip_alarm(axes: Any, alarm: Any, since_ms: AnyFloats, horizon_ms: flo
 
 
 TRIALS, EPOCHS, STRIDE = 60, 8, 2
-SETTING, SETTING_SEED = 24, 1  # further trials, which the levels of the alarms are set on
-EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
+SETTING, SETTING_SEED = 24, 1  # number and seed of further trials, for setting the alarm thresholds
+EFFORT = 1.15  # maximum load of the plan, relative to the friction limit: the plan of each trial causes slip
 LIVE_S = 60.0
-PER_HOUR = 60.0  # false alarms: one a minute, as `tacpipe evaluate` allows
+PER_HOUR = 60.0  # accepted false alarms: one per minute, as in `tacpipe evaluate`
 SEED = 7
-AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # the plan: its length, the time between plans, the time between points
+AHEAD_S, EVERY_S, POINT_S = (
+    0.5,
+    0.1,
+    0.02,
+)  # the plan: its length, the interval between plans, the interval between points
 SWITCH_S = 0.0005
 
 
 def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
-    """Train, emulate, run live, print what the alarms were worth, and return the path of the picture.
+    """Train, emulate, run live, print the results of the alarms, and return the path of the picture.
 
     Raises `TacpipeError` if a command fails.
     """
@@ -186,7 +190,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
 
 
 def _train(output: Path) -> None:
-    """Simulate trials and train on them, and others to set alarms on; what is stored already is reused."""
+    """Simulate trials and train on them, and simulate others for setting alarms; existing results are reused."""
     segments, split = str(output / "segments"), str(output / "split")
     _simulate(output, "segments", TRIALS, 0)
     _simulate(output, "setting", SETTING, SETTING_SEED)
@@ -196,7 +200,7 @@ def _train(output: Path) -> None:
 
 
 def _simulate(output: Path, name: str, trials: int, seed: int) -> None:
-    """Simulate trials, up to their contacts."""
+    """Simulate trials and segment their contacts."""
     recordings, synced = str(output / f"{name}-recordings"), str(output / f"{name}-synced")
     options = ("--trials", str(trials), "--seed", str(seed), "--effort", str(EFFORT))
     _tacpipe("simulate", "forward", *options, "-o", recordings, "--quiet")
@@ -212,7 +216,7 @@ def _tacpipe(*words: str) -> None:
 
 
 def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
-    """Send where the emulated hand will be, as a controller would."""
+    """Send the future motion of the emulated hand, as a controller would."""
     import socket
 
     offset_ns = time.time_ns() - time.monotonic_ns()
@@ -225,7 +229,7 @@ def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
 
 
 def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
-    """Print and draw the last session against the slips of the simulation."""
+    """Print and draw the last session with the slips of the simulation."""
     import tacpipe
 
     recordings = tacpipe.open(output / "live")
@@ -255,7 +259,7 @@ def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
 
 
 def describe_lead(name: str, lead: Leads) -> str:
-    """Return what an alarm was worth in words.
+    """Return the results of an alarm in words.
 
     >>> describe_lead("slip", Leads(4, (120.0, 80.0), 1, 0.005))
     'slip alarm: 2 of 4 slips led, by 100 ms in the median; 1 false alarm in 18 s'

@@ -1,6 +1,7 @@
-"""Forecast at each grid point of a live session, as soon as the samples that belong to it have come.
+"""Forecast at each grid point of a live session, as soon as its samples have arrived.
 
-Where several grid points are due, this process fell behind: the newest is published, the others are counted as skipped.
+If several grid points are due, this process fell behind: the newest is published, and the others are counted as
+skipped.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ if TYPE_CHECKING:
 
     from tacpipe.live.wire import AlarmsJson
 
-PERIODS = 2.0  # periods without a forecast after which a message states the cause
+PERIODS = 2.0  # periods without a forecast after which a message reports the cause
 SLACK_NS = 5_000_000  # additional time for jitter
 EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
-LITTLE_NS = 300_000  # a shorter wait until then is not worth waking for
-STARTING_S = 0.005  # wait between two tries while the grid is unknown
+LITTLE_NS = 300_000  # minimum wait until then for which the process sleeps
+STARTING_S = 0.005  # wait between two attempts while the grid is unknown
 
 
 class CausalChain(Protocol):
@@ -42,7 +43,7 @@ class CausalChain(Protocol):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Names of the streams that are read."""
+        """The names of the streams that are read."""
 
     @property
     def master(self) -> str:
@@ -50,15 +51,15 @@ class CausalChain(Protocol):
 
     @property
     def rate_hz(self) -> float:
-        """Grid points a second."""
+        """Grid points per second."""
 
     @property
     def horizon(self) -> int:
-        """How many steps ahead are predicted."""
+        """The number of predicted steps."""
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the predicted channels."""
+        """The names of the predicted channels."""
 
     @property
     def layout(self) -> tuple[Mapping[str, str], ...]:
@@ -66,31 +67,31 @@ class CausalChain(Protocol):
 
     @property
     def unit(self) -> str:
-        """Unit of the predicted channels."""
+        """The unit of the predicted channels."""
 
     @property
     def late(self) -> Mapping[str, int]:
-        """Samples that came too late, by stream."""
+        """The number of late samples, by stream."""
 
     @property
     def beginning(self) -> Beginning | None:
         """The state that a chain needs to continue the session; None until it is known."""
 
     def push(self, stream: str, batch: Any) -> None:
-        """Take samples."""
+        """Add samples of a stream."""
 
     def continue_cameras(self, previous: Any) -> None:
         """Continue the channels of the cameras of an earlier chain."""
 
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
-        """Return the forecasts up to a time, on request of the newest grid point alone."""
+        """Return the forecasts up to a time, or optionally of the newest grid point only."""
 
 
 Opened = Callable[[Mapping[str, "pa.Schema"], "Beginning | None"], CausalChain]
 
 
 class ForecastEngine(Engine):
-    """One live session: a chain for each recording of it, and for each stretch after blocks were thrown away."""
+    """Run the forecasts of a live session, with a new chain for each recording and after blocks were discarded."""
 
     def __init__(
         self,
@@ -108,23 +109,23 @@ class ForecastEngine(Engine):
         self.chain = opened({name: likely_schema(sensor) for name, sensor in self.sensors.items()}, None)
         self.alarms = alarms(self.chain)
         self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
-        self._late = 0  # samples that came too late for chains before
-        self._first: dict[str, pa.Schema] = {}  # schema of what each stream gave first
+        self._late = 0  # late samples of earlier chains
+        self._first: dict[str, pa.Schema] = {}  # schema of the first samples of each stream
         self._begun: set[str] = set()
         self._decoders = self._new_decoders()
-        self._last_ns: int | None = None  # monotonic, of the last message
+        self._last_ns: int | None = None  # time of the last message, monotonic clock
         self._point_ns: int | None = None  # time of the last grid point
-        self._why = ""  # there is a chain and yet no grid: why
+        self._why = ""  # why there is no grid although there is a chain
         self._continues: Beginning | None = None  # state of an earlier process that the next recording continues
 
     @property
     def period_ns(self) -> int:
-        """Time between grid points."""
+        """The interval between grid points."""
         return round(1e9 / self.chain.rate_hz)
 
     @property
     def late(self) -> int:
-        """Samples so far that came after the row that they belong to was made."""
+        """The number of samples so far that arrived after their row was computed."""
         return self._late + sum(self.chain.late.values())
 
     @property
@@ -133,20 +134,20 @@ class ForecastEngine(Engine):
         return self.chain.beginning
 
     def describe(self, model: str) -> ForecastDescription:
-        """Return what the values of messages are."""
+        """Return the description of the values in messages."""
         chain = self.chain
         return ForecastDescription(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
 
     def alarm_levels(self) -> AlarmsJson:
-        """Return the levels of the alarms."""
+        """Return the thresholds of the alarms."""
         return self.alarms.to_json()
 
     def continue_recording(self, beginning: str) -> None:
-        """Take grid and level at rest of a process that ended; the next recording continues them."""
+        """Store grid and rest level of an earlier process, which the next recording continues."""
         self._continues = Beginning.from_json(json.loads(beginning))
 
     def begin_recording(self, offset_ns: int) -> None:
-        """Begin a recording with a new chain, or with one that continues the process before."""
+        """Start a recording with a new chain, or with one that continues the previous process."""
         self._begun = set()
         self._decoders = self._new_decoders()
         continues, self._continues = self._continues, None
@@ -155,7 +156,7 @@ class ForecastEngine(Engine):
         )
 
     def overflow(self) -> None:
-        """Continue with a chain that lacks the blocks that were thrown away."""
+        """Continue with a chain without the blocks that were discarded."""
         if self.running:
             self.overflows += 1
             previous = self.chain
@@ -163,18 +164,18 @@ class ForecastEngine(Engine):
             self.chain.continue_cameras(previous)
 
     def begin_stream(self, stream: str) -> None:
-        """Decode a stream from the start of the recording on."""
+        """Start decoding a stream at the start of the recording."""
         self._begun.add(stream)
         self._decoders[stream] = Decoder(self.sensors[stream])
 
     def take_note(self, stream: str, note: StreamNote) -> None:
-        """Take a note on a stream; bytes that were lost go to its decoder."""
+        """Process a note on a stream; lost bytes are passed to its decoder."""
         super().take_note(stream, note)
         if note.what != BEGAN:
             self._keep(stream, note)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Keep bytes of a stream that the chain reads; before a recording, find out which columns the stream has."""
+        """Store bytes of a stream that the chain reads; before a recording, detect the columns of the stream."""
         self._keep(stream, chunks)
 
     def _keep(self, stream: str, block: Chunks | StreamNote) -> None:
@@ -184,7 +185,7 @@ class ForecastEngine(Engine):
             self._look(stream)
 
     def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock: early, to decode, then when a row is due."""
+        """Return when to call `step` next, on the monotonic clock: first to decode, then when a row is due."""
         due_ns = self._row_ns
         if due_ns is None:
             return now_ns + round(STARTING_S * 1e9)
@@ -193,9 +194,9 @@ class ForecastEngine(Engine):
         return max(due_ns - EARLY_NS, now_ns) if due_ns - EARLY_NS - now_ns > LITTLE_NS else due_ns
 
     def step(self, now_ns: int) -> list[ForecastMessage]:
-        """Return the message that is due: the newest forecast, or that there has been none for `PERIODS`.
+        """Return the message that is due: the newest forecast, or that there has been no forecast for `PERIODS`.
 
-        Before a row is due what came is decoded, and nothing returned.
+        Before a row is due, new bytes are decoded and nothing is returned.
         """
         if self._offset_ns is None or len(self._begun) < len(self.sensors):
             return []
@@ -214,7 +215,7 @@ class ForecastEngine(Engine):
         return [message]
 
     def published(self, message: messages.Message, now_ns: int) -> None:
-        """Write latency and age into a message that is about to be published."""
+        """Write latency and age into a message just before it is published."""
         super().published(message, now_ns)
         if self._offset_ns is None or not message.answers:
             return
@@ -223,13 +224,13 @@ class ForecastEngine(Engine):
 
     @property
     def _row_ns(self) -> int | None:
-        """When the next row is due, on the monotonic clock, or None if that is not known."""
+        """Return when the next row is due, on the monotonic clock, or None if unknown."""
         if self._point_ns is None or self._offset_ns is None:
             return None
         return self._point_ns + self.period_ns - self._offset_ns + self.settle_ns
 
     def _decode(self, offset_ns: int, until_ns: int | None) -> None:
-        """Decode what came and give it to the chain; where a row is due, only what may hold samples up to ``until_ns``."""
+        """Decode new bytes and pass them to the chain; if a row is due, only those with samples up to ``until_ns``."""
         for name, decoder in self._decoders.items():
             if until_ns is None or decoder.may_hold(until_ns):
                 for batch in decoder.batches():
@@ -247,7 +248,7 @@ class ForecastEngine(Engine):
             self.next_seq(),
             forecast.t_ns,
             values,
-            words(forecast),
+            describe_cause(forecast),
             forecast.cause.value,
             states,
             forecast.made_from_t_ns,
@@ -257,7 +258,7 @@ class ForecastEngine(Engine):
         )
 
     def _silence(self, now_ns: int) -> list[ForecastMessage]:
-        """Return a message without a forecast where there was none for too long."""
+        """Return a message without a forecast if there has been none for too long."""
         assert self._offset_ns is not None
         if self._last_ns is None:
             self._last_ns = now_ns
@@ -287,7 +288,7 @@ class ForecastEngine(Engine):
         self._why = cause
 
     def _look(self, stream: str) -> None:
-        """Take note of the schema of what a stream gives, before a recording begins."""
+        """Record the schema of a stream's samples before a recording starts."""
         for batch in self._decoders[stream].batches():
             self._first.setdefault(stream, batch_schema(batch, self.sensors[stream]))
 
@@ -295,10 +296,10 @@ class ForecastEngine(Engine):
         return {name: Decoder(sensor) for name, sensor in self.sensors.items()}
 
 
-def words(forecast: GridForecast) -> str:
+def describe_cause(forecast: GridForecast) -> str:
     """Return the cause of a forecast in words.
 
-    >>> words(GridForecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))
+    >>> describe_cause(GridForecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))
     'nothing new comes from xela2'
     """
     cause = forecast.cause

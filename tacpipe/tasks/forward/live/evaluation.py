@@ -1,8 +1,8 @@
-"""Recordings of live sessions evaluated: what was published next to what the offline chain and model give of the same.
+"""Evaluate recordings of live sessions: compare the published forecasts with those of the offline chain and model.
 
-`evaluate` returns what `tacpipe evaluate` does of the recordings after the model's own stages, and adds what the session
-recorded: errors of the published forecasts, alarms with their leads, latencies, and whether `tacpipe predict --causal` gives
-the published values again, bit for bit.
+`evaluate` returns the result of `tacpipe evaluate` on the recordings after the model's own stages, and adds what the
+session recorded: errors of the published forecasts, alarms with their leads, latencies, and whether `tacpipe predict
+--causal` reproduces the published values bit for bit.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from tacpipe.tasks.forward.tracks import Levels, Track
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
-LEVELS = "live_alarm_levels"  # attribute of a recording: the levels of its alarms, as JSON
+LEVELS = "live_alarm_levels"  # attribute of a recording: the thresholds of its alarms, as JSON
 DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
-MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
+MODEL = "live_model"  # attribute of a recording: the digest of the model of its session
 
 
 class _Offline(NamedTuple):
@@ -54,7 +54,7 @@ class _Offline(NamedTuple):
 
 
 def evaluate(model: Model, recordings: Dataset) -> Result:
-    """Return the evaluation of recordings of live sessions.
+    """Evaluate recordings of live sessions.
 
     Raises `UsageError` if one has no stream ``forecast``, or its session ran another model.
     """
@@ -89,9 +89,9 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
 
 
 def check(digest: str, recordings: Dataset) -> None:
-    """Refuse recordings without a session, and those of a session that ran another model than that of this digest.
+    """Raise `UsageError` for recordings without a session, or of a session with another model than that of this digest.
 
-    What another model published describes nothing of this one, and differs from what this one predicts in every row.
+    The messages of another model describe nothing of this model and differ from its predictions in every row.
     """
     for name, recording in sorted(recordings.recordings.items()):
         if "forecast" not in recording.streams:
@@ -99,7 +99,7 @@ def check(digest: str, recordings: Dataset) -> None:
                 f"{name} is not a recording of a live session: it has no stream forecast. Give what `tacpipe live -o` "
                 f"recorded, or leave --live out."
             )
-        ran = recording.attributes.get(MODEL, digest)  # nothing states it in what other programs recorded
+        ran = recording.attributes.get(MODEL, digest)  # missing in recordings of other programs
         if ran != digest:
             raise UsageError(
                 f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}. Its published "
@@ -159,7 +159,7 @@ def _errors(
     predicted: _Offline,
     steps: tuple[int, ...],
 ) -> tuple[int, Sums]:
-    """Return how many rows all predictors have, and the sums of their errors over these."""
+    """Return the number of rows that all predictors have, and the sums of their errors over these rows."""
     row_ns, values = session.t_ns, session.values
     if not set(steps) <= set(session.steps) or chain.rest is None or not len(predicted.now):
         return 0, {}
@@ -193,7 +193,7 @@ def _errors(
 
 
 def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
-    """Return how many rows differ within a context after, or a row before, samples that came too late."""
+    """Return how many rows differ within a context after, or one row before, samples that arrived too late."""
     period_ns = 1e9 / float(forecaster.config["rate_hz"])
     reach_ns = (forecaster.context + 1) * period_ns
     if not len(late_ns):
@@ -209,7 +209,7 @@ def _alarms(
     track: Track,
     predicted: _Offline,
 ) -> dict[str, dict[str, Leads]]:
-    """Return what alarms were worth: by alarm, by event, live and offline."""
+    """Return the leads of alarms by alarm and event, live and offline."""
     stream = tables["alarm"]
     states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
     if not any((measured >= 0).any() for measured in states.values()):
@@ -247,7 +247,7 @@ def _events(forecaster: Forecaster, track: Track) -> dict[str, Times]:
 def _offline_states(
     forecaster: Forecaster, recording: Recording, track: Track, predicted: _Offline
 ) -> dict[str, Int64s]:
-    """Return the states of alarms (window,) with the session's levels, of offline predictions."""
+    """Return the alarm states (window,) of offline predictions with the session's thresholds."""
     alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
     layout = forecaster.codec.layout
     states = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
@@ -260,7 +260,7 @@ def _offline_states(
 def _headline(
     forecaster: Forecaster, sessions: Mapping[str, Session], steps: tuple[int, ...], channels: int
 ) -> list[Any]:
-    """Return how what was published compares with persistence of the same rows."""
+    """Return the comparison of the published forecasts with persistence on the same rows."""
     compared = {name: session for name, session in sessions.items() if session.rows}
     if not compared:
         return []
@@ -280,17 +280,17 @@ def _headline(
 
 @dataclass(frozen=True)
 class Published:
-    """The forecasts of a session, and the quantiles that it published next to them."""
+    """The forecasts of a session, and the quantiles that it published with them."""
 
     t_ns: Times  # (row,), of the grid points
     steps: tuple[int, ...]
     values: Float32s  # (row, step, channel)
-    levels: tuple[int, ...]  # levels of the quantiles, percent; empty: none were published
+    levels: tuple[int, ...]  # levels of the quantiles in percent; empty if none were published
     quantiles: Float32s  # (row, level x step, channel)
 
     @classmethod
     def from_stream(cls, forecast: Any, channels: Sequence[str], trained_levels: Sequence[int] = ()) -> Published:
-        """Return what a stream of forecasts (an arrow table) of some channels holds, and quantiles of ``known`` levels."""
+        """Return the forecasts in a stream (an arrow table) of ``channels``, and the quantiles of ``trained_levels``."""
         ends = {name.rpartition("_t")[2] for name in forecast.column_names if name.rpartition("_t")[0] in channels}
         steps = sorted({int(end.partition("_q")[0]) for end in ends})
         levels = [level for level in trained_levels if any(end.endswith(f"_q{level}") for end in ends)]
@@ -311,7 +311,7 @@ class Published:
         return np.concatenate([self.values, self.quantiles], axis=1)
 
     def matching_rows(self, forecasts: Sequence[GridForecast]) -> Float32s:
-        """Return the same of other forecasts, which all have values and as many quantiles as were published."""
+        """Return the same for other forecasts, which must all have values and the published quantiles."""
         places = [step - 1 for step in self.steps]
         rows: list[Float32s] = []
         for forecast in forecasts:
@@ -324,6 +324,6 @@ class Published:
 
 
 def times(stream: Any) -> Times:
-    """Return the times of the rows that a stream of a session is about (row,)."""
+    """Return the times (row,) of the rows that a stream of a session describes."""
     t_ns: Times = stream.column("t_device_ns").to_numpy()
     return t_ns

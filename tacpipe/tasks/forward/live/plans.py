@@ -1,7 +1,7 @@
-"""Read the planned motion of a live session: from a controller that sends it, or from the set-points of an arm.
+"""Read the planned motion of a live session from a controller that sends it, or from the set-points of an arm.
 
-A set-point is the pose at which the hand should be now, not later. Its motion in the last moments is assumed to continue. It
-is free of the noise of measured positions, and ahead of the hand by the lag of the arm's controller.
+A set-point is the pose at which the hand should be now, not later; its recent motion is assumed to continue. It does
+not have the noise of measured positions, and is ahead of the hand by the lag of the arm's controller.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 LOCAL = "127.0.0.1"  # default host of plans by UDP
-RIG = "rig"  # scheme of a plan from one of the rig's own streams
+RIG = "rig"  # scheme of a plan from a stream of the rig
 
 
 def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
-    """Return a rig with a stream of plans that come from an address; with ``measured``, or one of the rig's own, as it is.
+    """Return a rig with a stream of plans from an address; unchanged for ``measured`` or a stream of the rig.
 
-    ``sender`` is the address of the only computer whose plans are accepted by UDP; a port that other computers can reach
-    needs one. Raises `UsageError` for what is no address, and where the rig has a stream of that name, or lacks that which
-    is named.
+    ``sender`` is the only IP address from which plans are accepted by UDP; it is required for a port that other
+    computers can reach. Raises `UsageError` if the address is invalid, or the rig already has a stream of that name or
+    lacks the given one.
     """
     if sender:
         _check_sender(sender, plan)
@@ -68,7 +68,7 @@ def _check_sender(sender: str, plan: str) -> None:
 
 
 def _restrict_address(place: str, sender: str) -> str:
-    """Return the place of a UDP port that only this computer, or only the sender, can send plans to."""
+    """Return the address of a UDP port that accepts plans from this computer, or from the sender, only."""
     place, _, option = place.partition("?")
     if option and sender:
         raise UsageError(f"--plan-from {excerpt(sender)}: leave ?{plain(option)} of --plan out.")
@@ -92,7 +92,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def target_stream(rig: Rig, plan: str) -> str:
-    """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` if there is none."""
+    """Return the stream in ``rig:STREAM``, or empty for any other source. Raises `UsageError` if there is no such stream."""
     scheme, _, stream = plan.partition(":")
     if scheme != RIG:
         return ""
@@ -104,16 +104,16 @@ def target_stream(rig: Rig, plan: str) -> str:
 
 
 POSITION, ORIENTATION = "target_position", "target_orientation"  # quantities
-SPAN_NS = 20_000_000  # over which the set-point's speed is taken
-OLD_NS = 50_000_000  # age of the newest set-point, from which on there is no plan
+SPAN_NS = 20_000_000  # span over which the set-point's speed is computed
+OLD_NS = 50_000_000  # maximum age of the newest set-point; an older one is no plan
 AS_OPTIONS = "target_TCP_pose among the outputs of ur-rtde, RSol among those of kuka-rsi, targets = true of franka"
 
 
 class Targets:
-    """The newest set-points of one arm's stream."""
+    """The newest set-points in an arm's stream."""
 
     def __init__(self, stream: str, schema: pa.Schema) -> None:
-        """Take the stream's schema. Raises `UsageError` if it holds no set-points of a pose."""
+        """Find the set-points in the stream's schema. Raises `UsageError` if it has no set-points of a pose."""
         self.stream = stream
         fields_by_part = {(_about(field, "quantity"), _about(field, "component")): field for field in schema}
         parts = [*((POSITION, axis) for axis in AXES), *((ORIENTATION, part) for part in COMPONENTS)]
@@ -131,17 +131,17 @@ class Targets:
         self._kept: deque[tuple[int, Floats]] = deque()
 
     def push(self, batch: Any) -> None:
-        """Take samples of the stream in the order of their arrival."""
+        """Add samples of the stream in the order of their arrival."""
         names = batch.schema.names
         t_ns = np.asarray(batch.column(names.index("t_ns")))
         poses = np.column_stack([np.asarray(batch.column(names.index(name))) for name in self._names]) * self._scale
         self._kept.extend(zip(t_ns.tolist(), poses, strict=True))
 
     def state(self, t_ns: int) -> Float32s | None:
-        """Return pose and velocities (13,) that the controller aims at, or None if its newest set-point is too old.
+        """Return the target pose and velocities (13,) of the controller, or None if its newest set-point is too old.
 
-        The newest set-point that is not after ``t_ns`` counts, and for its velocities the one `SPAN_NS` before it. Times
-        must not run backwards from one call to the next.
+        The newest set-point up to ``t_ns`` is used, and for velocities also the one `SPAN_NS` before it. Successive
+        calls must have ascending times.
         """
         past = [set_point for set_point in self._kept if set_point[0] <= t_ns]
         if not past or t_ns - past[-1][0] > OLD_NS or not np.isfinite(past[-1][1]).all():
@@ -160,7 +160,7 @@ class Targets:
 
 
 def facing(state: Float32s, arm: Float32s) -> Float32s:
-    """Return a state (13,) whose quaternion has the sign of that of the arm (13,)."""
+    """Return a state (13,) with the sign of its quaternion chosen to match that of the arm (13,)."""
     if state[3:POSE] @ arm[3:POSE] >= 0:
         return state
     turned = state.copy()

@@ -1,4 +1,4 @@
-"""Recordings given to a `LiveChain` as they were recorded: what `tacpipe predict --causal` writes."""
+"""Replay recordings through a `LiveChain` in the order of arrival, for `tacpipe predict --causal`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
     from tacpipe.store.records import Step
 
-PIECE_NS = 1_000_000_000  # length of the pieces of a recording that a chain gets
+PIECE_NS = 1_000_000_000  # duration of the chunks of a recording that a chain gets
 
 
 def predict(
@@ -35,10 +35,11 @@ def predict(
     *,
     allow_look_ahead: bool = False,
 ) -> Result:
-    """Return a table a recording, as `tasks.forward.prediction.predict` does, of forecasts that look at no later sample.
+    """Return one table of causal forecasts per recording, in the form of `tasks.forward.prediction.predict`.
 
-    Attributes count the grid points without a forecast, by cause. Raises `TacpipeError` for a step that the model does not
-    reach, for ``quantiles`` (percent) that it does not have, and where a recording's streams are not what it reads.
+    Attributes count the grid points without a forecast, by cause. Raises `TacpipeError` if a step is beyond the
+    horizon, the model does not have these ``quantiles`` (percent), or a recording's streams are not those that the
+    model reads.
     """
     forecaster = Forecaster.load(model.files)
     if quantiles:
@@ -75,7 +76,7 @@ def _predict_recording(
     *,
     allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
-    """Return the predictions of a recording, and how many grid points each cause had."""
+    """Return the predictions of a recording, and the number of grid points by cause."""
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
@@ -116,7 +117,8 @@ def build_chain(
 ) -> LiveChain:
     """Return the chain of a model for the streams ``tables`` of a recording.
 
-    The recording names the master stream and the source of plans. The rest is as in `LiveChain.for_model`.
+    The master stream and the source of plans are in the recording's attributes. The rest is as in
+    `LiveChain.for_model`.
     """
     schemas = {name: table.schema for name, table in tables.items()}
     plan = str(recording.attributes.get("live_plan", ""))
@@ -128,7 +130,7 @@ def build_chain(
 
 
 def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
-    """Yield the forecasts of a recording's streams, which are given to ``chain`` as they arrived, some at a time."""
+    """Yield the forecasts of a recording, whose samples are passed to ``chain`` in chunks, in the order of arrival."""
     stamps = {
         name: tables[name].column("t_ns").to_numpy()
         for name in (*chain.streams, PLAN)
@@ -147,7 +149,7 @@ def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Itera
 
 
 def _describe_causes(causes: Mapping[Cause, int]) -> str:
-    """Return the causes why there is no forecast, and how often each was."""
+    """Return the causes of missing forecasts and their numbers in words."""
     counted = [f"{count} {_name(cause)}" for cause, count in causes.items() if cause & BLOCKING]
     return ", ".join(counted) or "there is none"
 

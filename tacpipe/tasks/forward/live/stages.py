@@ -1,4 +1,4 @@
-"""The stages that a model was trained behind, as far as they have a rule that does not look ahead."""
+"""Find the preprocessing stages of a model, and check that each has a causal rule."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
 
 
 class CausalStages(NamedTuple):
-    """The params of the stages that a model's rows went through; its codec is among its files."""
+    """The params of a model's preprocessing stages; its codec is among its files."""
 
     synchronize: Any
     contacts: Any
 
     @property
     def largest_step(self) -> float:
-        """How many periods two rows may be apart with none missing between."""
+        """The maximum distance of adjacent rows in periods; a larger one is a gap."""
         return max_step({GRID: self.synchronize.timeline})
 
 
 def causal_stages(steps: Sequence[Step]) -> CausalStages:
-    """Return the params of the stages of a chain, as manifests list them.
+    """Return the params of the stages of a chain, given as in manifests.
 
-    Raises `UsageError` if a stage has another version now, `TacpipeError` if one has no causal rule or is absent.
+    Raises `UsageError` if the version of a stage has changed, `TacpipeError` if one has no causal rule or is missing.
     """
     params_by_stage = {}
     for step in steps:
@@ -60,10 +60,10 @@ def causal_stages(steps: Sequence[Step]) -> CausalStages:
 def refuse_look_ahead(config: ForwardConfig, steps: Sequence[Step]) -> None:
     """Raise `TacpipeError` for a model that was trained on rows that look ahead.
 
-    ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
+    ``config`` is the model's configuration, ``steps`` are its preprocessing stages.
     """
     look_ahead = config.get("look_ahead")
-    if look_ahead is None:  # a model of an older version, or of rows that state nothing
+    if look_ahead is None:  # a model of an older version, or recordings without this information
         interpolated = [
             step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
         ]

@@ -1,4 +1,4 @@
-"""Run models of forward live: their settings, the plan of a session, and the engine with its alarms."""
+"""Run forecasting models live: their settings, the plan of a session, and the engine with its alarms."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ALARM_KEYS = ("alarms_per_hour", "alarms_on", "split")
 
 @dataclass(frozen=True)
 class ForwardSettings(TaskSettings):
-    """Settings of a session with a model of forward."""
+    """Settings of a session with a forecasting model."""
 
     # Source of plans: measured (motion continues; default), udp::PORT, ws:HOST:PORT, rig:STREAM (its set-points)
     plan: str = MEASURED
@@ -44,11 +44,11 @@ class ForwardSettings(TaskSettings):
 
     @classmethod
     def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:
-        """Return what a rig file states, without its alarms or its split where the options have others."""
+        """Return the settings of a rig file, without its alarms or its split if the options override them."""
         void: tuple[str, ...] = ()
-        if options.get("alarms_per_hour") == 0:  # the option 0 switches off the alarms of the file
+        if options.get("alarms_per_hour") == 0:  # the option 0 disables the alarms of the file
             void = ALARM_KEYS
-        elif "alarms_on" in options and "split" not in options:  # the file's split is of the file's recordings
+        elif "alarms_on" in options and "split" not in options:  # the file's split belongs to the file's recordings
             void = ("split",)
         return {name: value for name, value in file_settings.items() if name not in void}
 
@@ -65,7 +65,7 @@ class ForwardSettings(TaskSettings):
             raise UsageError(f"{settings.name_in_errors('split')} has no effect without {option('alarms_on')}.")
 
     def steps_up_to(self, horizon: int) -> tuple[int, ...]:
-        """Return the steps ahead that are published. Raises `UsageError` for others than the model predicts."""
+        """Return the steps to publish. Raises `UsageError` for steps beyond the model's horizon."""
         steps = tuple(sorted(set(self.steps))) or tuple(range(1, horizon + 1))
         if steps[-1] > horizon:
             listed = ",".join(map(str, self.steps))
@@ -116,7 +116,7 @@ class ForwardLive(LiveTask):
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
-        """Return the engine with the model's causal chain, which has made its first forecast."""
+        """Return the engine with the model's causal chain, after a first forecast."""
         from tacpipe.tasks.forward.forecaster import Forecaster
         from tacpipe.tasks.forward.live import plans
         from tacpipe.tasks.forward.live.chain import LiveChain
@@ -148,14 +148,14 @@ class ForwardLive(LiveTask):
         return engine
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return a table of causal forecasts for each recording."""
+        """Return one table of causal forecasts per recording."""
         from tacpipe.tasks.forward.live import replay
 
         look_ahead = request.allow_look_ahead
         return replay.predict(model, recordings, request.steps, request.quantiles, allow_look_ahead=look_ahead)
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
-        """Return the evaluation of recordings of sessions: published forecasts next to those of the offline chain."""
+        """Evaluate recordings of sessions: published forecasts and those of the offline chain."""
         from tacpipe.tasks.forward.live import evaluation
 
         return evaluation.evaluate(model, recordings)
@@ -180,13 +180,13 @@ def _refuse_absent_quantiles(
 
 @dataclass(frozen=True)
 class CalibratedLevels:
-    """The quantiles that a model was calibrated for."""
+    """The quantiles for which a model was calibrated."""
 
     percents: tuple[int, ...]
 
 
 def _alarms(own_settings: ForwardSettings, model: Dataset, chain: CausalChain) -> Alarms:
-    """Return the alarms of a session, with levels where it has any."""
+    """Return the alarms of a session, with thresholds if it has any."""
     from tacpipe.engine.pipeline import open_dataset
     from tacpipe.tasks.forward.live.alarms import Alarms, on_recordings
 

@@ -33,11 +33,11 @@ class ForwardReport(TaskReport):
     title = "forecasts of tactile signals"
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
-        """Return the runs of results that hold error sums of recordings which the model has not seen."""
+        """Return the runs of results with error sums of recordings that the model was not trained on."""
         return methods.read_runs(results)
 
     def kind(self, predictor: str) -> Kind:
-        """Return what a predictor is.
+        """Return the kind of a predictor.
 
         >>> report = ForwardReport("forward")
         >>> [report.kind(name) for name in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
@@ -59,13 +59,13 @@ class ForwardReport(TaskReport):
         return super().predictor_name(predictor.removeprefix("model_"))
 
     def uses(self, dataset: Dataset) -> bool:
-        """Return whether a dataset is of ``tacpipe compress``, whose losses are drawn next to the errors of forecasts."""
+        """Return whether a dataset is a codec of ``tacpipe compress``, whose losses are drawn with the forecast errors."""
         return representations.CODEC_FILE in dataset.files
 
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
+        """Return further columns for the table of all methods: skill by step, and errors if channels have other units."""
         steps, known_objects = _steps(context), _known_objects(comparison.question)
         unit = comparison.measure.unit
 
@@ -103,7 +103,7 @@ class ForwardReport(TaskReport):
         ]
 
     def folds(self, context: Context) -> list[Fold]:
-        """Return what forecasts have of their own."""
+        """Return the sections that only forecasts have."""
         if not context.comparisons:
             return representations.representation_folds(context)
         return [
@@ -122,7 +122,7 @@ class ForwardReport(TaskReport):
         ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return what must be known about these numbers."""
+        """Return the limitations of these results."""
         runs = [run.details for run in context.runs]
         known_by_recording: dict[str, set[bool]] = {}
         values: dict[str, set[Any]] = {}
@@ -160,18 +160,18 @@ class ForwardReport(TaskReport):
         ]  # fmt: skip
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return more columns of the table of runs."""
+        """Return further columns for the table of runs."""
         epochs = len(run.details.history)
         return {"epochs": str(epochs) if epochs else NONE}
 
 
-LINES = 4  # methods in a figure of skill, the paper's not counted
-FLOOR = -1.0  # skill at which figures end
+LINES = 4  # maximum number of methods in a figure of skill, in addition to the paper's
+FLOOR = -1.0  # minimum skill in figures
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
 
 
 def _look_ahead_notes(context: Context) -> list[str]:
-    """Return how far the rows that models were trained on look ahead, with their methods where others do not."""
+    """Return how far the training rows of models look ahead, with the methods' names if they differ."""
     methods: dict[str, list[str]] = {}
     for method in context.methods:
         for note in dict.fromkeys(
@@ -185,7 +185,7 @@ def _look_ahead_notes(context: Context) -> list[str]:
 
 
 def _skill_ahead_charts(context: Context) -> list[Fold]:
-    """Return skill over the time ahead of the best methods, the paper's and the best baseline, a chart a part."""
+    """Return charts of skill by time ahead for the best methods, the paper's and the best baseline, one per part."""
     drawn, order = [], list[str]()
     chosen = {comparison: _rows_to_show(context, comparison) for comparison in context.comparisons}
     for rows in chosen.values():
@@ -219,7 +219,7 @@ def _rows_to_show(context: Context, comparison: Comparison) -> list[ComparisonRo
 
 
 def _channels(context: Context) -> list[Fold]:
-    """Return errors and skill by sensor and axis of the best method, of the paper's, and of persistence."""
+    """Return errors and skill by sensor and axis for the best method, the paper's, and persistence."""
     tables: list[Table] = []
     steps = _steps(context)
     for comparison in context.comparisons:
@@ -262,7 +262,7 @@ def _channels(context: Context) -> list[Fold]:
 
 
 def _ablations(context: Context) -> list[Fold]:
-    """Return what the plan and the timeline change: methods alike but for one of them."""
+    """Return the effect of the plan and of the timeline, by comparing methods that differ only in one of them."""
     steps = _steps(context)
     parts = list(dict.fromkeys(_known_objects(comparison.question) for comparison in context.comparisons))
     tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
@@ -343,7 +343,7 @@ def _known_objects(question: Question) -> bool | None:
 
 
 def _families(methods: Sequence[Method], setting: str) -> list[list[Method]]:
-    """Return the methods that differ in one setting alone, where there are several such."""
+    """Return groups of several methods that differ only in one setting."""
     by_key: dict[str, list[Method]] = {}
     for method in methods:
         by_key.setdefault(method.key_without(setting), []).append(method)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 
-OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
+OFF_SCALE = ("context_mean", "train_mean")  # their errors are so large that the other lines would coincide
 EXPLAINED = {
     "model": "the trained model",
     "persistence": "no change: the last frame is repeated",
@@ -42,7 +42,7 @@ EXPLAINED = {
 
 
 def run_folds(method: str, run: ComparedRun) -> list[Fold]:
-    """Return the errors of a run of a method, or nothing if the result holds no errors by step."""
+    """Return the errors of a method's run, or nothing if the result has no errors by step."""
     result: ForwardResult = run.details
     metrics, unit = result.metrics, headline.unit_of_model(result.config)
     names = _ordered_predictors(metrics.fresh)
@@ -59,7 +59,7 @@ def run_folds(method: str, run: ComparedRun) -> list[Fold]:
 
 
 def predictor_title(predictor: str) -> str:
-    """Return a name of ``metrics.json`` as texts have it."""
+    """Return the name of a predictor of ``metrics.json`` for text."""
     return predictor.replace("_", " ")
 
 
@@ -139,7 +139,7 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
 
 
 def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
-    """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
+    """Return a warning if the codec's own loss exceeds the error of persistence, otherwise an empty string."""
     predictors = metrics.fresh.predictors
     if "codec" not in predictors:
         return ""
@@ -157,7 +157,7 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
 
 
 def _describe_seen(metrics: ForwardMetrics) -> str:
-    """Return the errors on recordings that the model was trained on, which prove nothing."""
+    """Return the errors on training recordings, which do not show how well the model generalizes."""
     seen = metrics.parts.get("seen")
     described = _single_ratio_skill(seen).get("mean", {}) if seen else {}
     if not seen or "mean" not in described:
@@ -168,7 +168,7 @@ def _describe_seen(metrics: ForwardMetrics) -> str:
 
 
 def _single_ratio_skill(part: ForwardScores) -> IntervalsByStep:
-    """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
+    """Return the skill from ratios of single recordings, or the pooled skill of results of older versions."""
     return part.skill.get(headline.GEOMETRIC, part.skill.get("mse_counts", {}))
 
 
@@ -181,17 +181,17 @@ def _error_cell(interval_tree: Mapping[str, float]) -> Cell:
 
 
 def _both_groups(scores: Mapping[str, dict[str, float]]) -> dict[str, float]:
-    """Return the errors over all channels; results of before this was called ``both`` call it ``all``."""
+    """Return the errors over all channels: ``both``, or ``all`` in results of older versions."""
     return scores["both"] if "both" in scores else scores["all"]
 
 
 def _ordered_predictors(scores: ForwardScores) -> list[str]:
-    """Return the names of model and baselines, model first, then persistence."""
+    """Return the names of model and baselines: the model first, then persistence."""
     order = list(EXPLAINED)
     return sorted(scores.predictors, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
-SHOWN_S = 12.0  # seconds of a recording that are drawn
+SHOWN_S = 12.0  # maximum drawn duration of a recording
 TRUTH = "truth now"
 UNSHIFTED = (
     "Each prediction is drawn at the time at which it was made, so a prediction that looks ahead is left of the "
@@ -203,10 +203,10 @@ UNSHIFTED = (
 def draw_traces(
     shard: Recording, latents: Sequence[int], steps: Sequence[int], title: str, caption: str = "", *, unit: str = ""
 ) -> list[Chart]:
-    """Return the first seconds of some latents of a recording, by their place from 0, and what was predicted of them.
+    """Draw the first seconds of some latents of a recording, by index from 0, with their predictions.
 
-    ``unit`` is that of latents which are the channels themselves. Latents and steps that the recording does not hold are
-    left out.
+    ``unit`` is the unit of latents that are channels. Latents and steps that the recording does not contain are
+    omitted.
     """
     table = shard.table()
     if not table.num_rows:
@@ -237,12 +237,12 @@ LOSS_NAMES = {"training": "train_loss", "validation": "val_loss"}
 
 
 def paper_representative(context: Context) -> Method | None:
-    """Return the paper's method where the recordings are the paper's."""
+    """Return the paper's method if the recordings are the paper's."""
     return methods.paper_method(context.methods) if context.published else None
 
 
 def _representatives(context: Context) -> list[tuple[Method, ComparedRun]]:
-    """Return a median run of the best method of the last part, and of the paper's: those that are shown singly."""
+    """Return a median run of the best method of the last part, and one of the paper's method, which are shown in detail."""
     compared = [candidate for candidate in context.comparisons if candidate.best]
     last = next(
         (candidate for candidate in reversed(compared) if candidate.question.place < 2), next(iter(compared), None)
@@ -265,7 +265,7 @@ def _representatives(context: Context) -> list[tuple[Method, ComparedRun]]:
 
 
 def prediction_folds(context: Context) -> list[Fold]:
-    """Return what was predicted next to what came, of recordings of median, lowest and highest skill, and the paper's."""
+    """Return predictions and measurements of the recordings with median, minimum and maximum skill, and of the paper's."""
     drawn = []
     for method, run in _representatives(context):
         ranked = ranked_trials(run)
@@ -282,7 +282,7 @@ def prediction_folds(context: Context) -> list[Fold]:
 
 
 def _unit_of_run(run: ComparedRun) -> str:
-    """Return the unit of the latents of a run: that of the channels where they are not compressed, else none."""
+    """Return the unit of the latents of a run: that of the channels if they are not compressed, otherwise empty."""
     config = run.details.config
     return headline.unit_of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
 
@@ -314,7 +314,7 @@ def _paper_traces(context: Context) -> list[Chart]:
 
 
 def ranked_trials(run: ComparedRun) -> list[tuple[float, str]]:
-    """Return skill and name of the recordings that the model has not seen, of the predictions that a result holds."""
+    """Return skill and name of the unseen recordings whose predictions are in a result."""
     text = run.dataset.files.get("trials.csv", b"").decode()
     return sorted(
         (float(trial["skill"]), trial["recording"])
@@ -342,5 +342,5 @@ def training_folds(context: Context) -> list[Fold]:
 
 
 def single_run_folds(context: Context) -> list[Fold]:
-    """Return the errors of representative runs in full, by predictor and step."""
+    """Return all errors of representative runs, by predictor and step."""
     return [run_fold for method, run in _representatives(context) for run_fold in run_folds(method.name, run)]

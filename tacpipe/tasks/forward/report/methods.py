@@ -1,4 +1,4 @@
-"""Read results of forecasts as runs of methods, from the sums of their errors."""
+"""Read forecast results as runs of methods, from their error sums."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ class ErrorSums:
 
     predictors: tuple[str, ...]
     groups: tuple[str, ...]
-    recordings: tuple[str, ...]  # that the model was not trained on
+    recordings: tuple[str, ...]  # recordings that the model was not trained on
     steps: tuple[int, ...]
-    known: Bools  # (recording,): other recordings of its object were trained on
-    windows: Int64s  # (recording,)
-    channels: Mapping[str, int]  # by group
+    known: Bools  # (recording,): whether other recordings of its object were used for training
+    windows: Int64s  # (recording,): number of windows
+    channels: Mapping[str, int]  # group -> number of channels
     squared: AnyFloats  # (predictor, group, recording, step)
     absolute: AnyFloats  # (predictor, group, recording, step)
-    named: bool = True  # whether any recording names its object: else none is known or unseen
-    objects: Mapping[str, str] = field(default_factory=dict)  # recording to its object, if it names one
+    named: bool = True  # whether any recording has an object; otherwise there are neither known nor unseen objects
+    objects: Mapping[str, str] = field(default_factory=dict)  # recording -> its object, if it has one
 
     def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
         """Return squared and absolute sums, both (recording, step), or None if there are none."""
@@ -68,9 +68,9 @@ class ErrorSums:
 
 
 def read_error_sums(content: bytes) -> ErrorSums:
-    """Return the sums that a file holds, without those of recordings that the model was trained on.
+    """Return the sums in a file, without those of training recordings.
 
-    Raises `TacpipeError` if a column is missing, or where predictors were not evaluated on the same windows.
+    Raises `TacpipeError` if a column is missing, or predictors were evaluated on different windows.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -118,21 +118,21 @@ def read_error_sums(content: bytes) -> ErrorSums:
 
 
 def _object_names(table: pa.Table) -> dict[str, str]:
-    """Return the object that each recording names."""
+    """Return the object of each recording that has one."""
     pairs = zip(table["recording"].to_pylist(), table["object"].to_pylist(), strict=True)
     return {recording: name for recording, name in pairs if name is not None}
 
 
 def _encode_text(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
-    """Return the distinct values of a text column in the order in which they come, and the place of each row's."""
+    """Return the distinct values of a text column in order of appearance, and the index of each row's value."""
     encoded = column.combine_chunks().dictionary_encode()
     return tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64)
 
 
 ACTIONS = ("planned", "none", "shuffled")
-_PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # latents the paper keeps
+_PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # number of latents in the paper
 _NO_METHOD = ("seed", "actions", "architecture", "baselines")  # params that do not define a method
-_PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
+_PREFERRED = ("pca", "autoencoder", "raw")  # by forecasting performance in the paper
 
 
 class ForwardResult(context.ReportResult[ForwardConfig]):
@@ -148,33 +148,33 @@ class ForwardResult(context.ReportResult[ForwardConfig]):
 
     @cached_property
     def errors(self) -> ErrorSums:
-        """The error sums of recordings that the model has not seen."""
+        """The error sums of recordings that the model was not trained on."""
         return read_error_sums(self.dataset.files[ERRORS_FILE])
 
     @property
     def actions(self) -> str:
-        """What the model is informed of the motion to come: one of `ACTIONS`."""
+        """The model's information on the future motion: one of `ACTIONS`."""
         return str(self.given.get("actions", "planned"))
 
     @property
     def timeline(self) -> str:
-        """What rows represent: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
+        """The meaning of rows: a ``uniform`` grid, ``logged`` rows or ``fresh`` frames."""
         return str(self.config.get("timeline", "uniform"))
 
     @property
     def rate_hz(self) -> float:
-        """Rows a second, or 0 if a row has no fixed duration."""
+        """Rows per second, or 0 if a row has no fixed duration."""
         return float(self.config.get("rate_hz") or 0)
 
     @property
     def settings(self) -> Settings:
-        """All that makes its method, without seed and split."""
+        """The settings that define its method, without seed and split."""
         params = {name: value for name, value in self.params.items() if name not in _NO_METHOD}
         codec = self.config["codec"]["name"]
         return {**params, "codec": codec, "actions": self.actions, "timeline": self.timeline}
 
     def name(self, usual: str) -> str:
-        """Return what its method is called, with a timeline that is not the ``usual`` one and a shortened schedule."""
+        """Return the name of its method, with its timeline if it is not the ``usual`` one, and a shortened schedule."""
         parts = [str(self.config["architecture"]).replace("_", " "), str(self.config["codec"]["name"])]
         if self.actions != "planned":
             parts.append("no actions" if self.actions == "none" else f"{self.actions} actions")
@@ -186,12 +186,12 @@ class ForwardResult(context.ReportResult[ForwardConfig]):
 
 
 def has_error_sums(dataset: Dataset) -> bool:
-    """Return whether a result holds what a comparison reads: only those of the task ``forward`` do."""
+    """Return whether a result has error sums; only results of the task ``forward`` do."""
     return all(name in dataset.files for name in ("metrics.json", "config.json", ERRORS_FILE))
 
 
 def main_timeline(runs: Sequence[ForwardResult]) -> str:
-    """Return the timeline of most runs; where two have as many, the last in the alphabet, which puts uniform first."""
+    """Return the timeline of most runs; in a tie, the alphabetically last, which prefers uniform."""
     count = Counter(run.timeline for run in runs)
     return max(count, key=lambda name: (count[name], name))
 
@@ -202,7 +202,7 @@ def is_recurrent(method: Method) -> bool:
 
 
 def paper_method(methods: Sequence[Method]) -> Method | None:
-    """Return the method nearest to what the paper found best: the recurrent model of 20 principal components."""
+    """Return the method nearest to the best of the paper: the recurrent model with 20 principal components."""
     candidates = [method for method in methods if is_recurrent(method) and codec_of(method)["of"] == "levels"]
     return min(candidates, key=_distance, default=None)
 
@@ -214,7 +214,7 @@ def codec_of(method: Method) -> CodecDescription:
 
 
 def paper_row(codec: CodecDescription) -> str | None:
-    """Return what Table 1 of the paper calls a representation, or None if it has none such.
+    """Return the name of a representation in Table 1 of the paper, or None if it is not in the table.
 
     >>> paper_row({"kind": "autoencoder", "of": "levels", "frames": 2, "latents": 8})
     'AE-C2'
@@ -230,18 +230,18 @@ def paper_row(codec: CodecDescription) -> str | None:
 
 
 def _distance(method: Method) -> tuple[int, int, int, str]:
-    """Return how far a recurrent method is from the paper's, for sorting."""
+    """Return a sort key by the distance of a recurrent method from the paper's."""
     codec = codec_of(method)
     kind = codec["kind"]
     off = abs(int(codec["latents"]) - _PAPER_WIDTH.get(kind, int(codec["latents"])))
     return _PREFERRED.index(kind), off, -len(method.runs), method.name
 
 
-ORACLES = ("codec", "codec_anchored")  # of what knows the true future
+ORACLES = ("codec", "codec_anchored")  # predictors that use the true future
 
 
 def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
-    """Return the runs of results that hold error sums of recordings which the model has not seen."""
+    """Return the runs of results with error sums of recordings that the model was not trained on."""
     all_results = [ForwardResult(result) for result in drop_duplicates(results) if has_error_sums(result)]
     runs = [result for result in all_results if result.errors.recordings]
     if not runs:
@@ -252,7 +252,7 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
 
 
 def name_with_codec(predictor: str, codec: str) -> str:
-    """Return the name of a predictor among several representations: those that go through a codec state which.
+    """Return the name of a predictor among several representations, with the codec's name if it depends on the codec.
 
     >>> name_with_codec("ridge", "PCA-20"), name_with_codec("codec_persistence", "PCA-20")
     ('ridge', 'codec_persistence PCA-20')
@@ -261,14 +261,14 @@ def name_with_codec(predictor: str, codec: str) -> str:
 
 
 def shown_steps(runs: Sequence[ForwardResult]) -> tuple[int, ...]:
-    """Return the steps to report on, those that all runs predict."""
+    """Return the steps to report, which all runs predict."""
     return headline.headline_steps(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
 
 
 def sums_by_recording(
     run: ForwardResult, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
 ) -> dict[str, AnyFloats]:
-    """Return what `headline.sums` adds up, by recording, or empty if a predictor has no errors in a group of channels."""
+    """Return the `headline.sums` of a predictor by recording, or empty if it has no errors in a group of channels."""
     errors = run.errors
     predictor_sums, persistence_sums = errors.of(predictor, group), errors.of(BASELINE, group)
     if predictor_sums is None or persistence_sums is None:
@@ -286,7 +286,7 @@ def sums_by_recording(
 
 
 def object_clusters(run: ForwardResult, known_objects: bool | None) -> dict[str, str] | None:
-    """Return the object of each recording of unseen objects, which is what chance draws there; None of other recordings."""
+    """Return the object of each recording, the cluster for unseen objects; None for other recordings."""
     errors = run.errors
     if known_objects is not False or not errors.objects:
         return None

@@ -27,24 +27,24 @@ CODEC_FILE = "codec.json"
 
 @dataclass(frozen=True)
 class CodecLoss:
-    """What codecs of one kind and width lose on the way to latents and back, the mean over the codecs."""
+    """The mean reconstruction loss of codecs of one kind and width."""
 
     series: str  # kind and class: PCA, AE-C1, …
     latents: int
     codecs: int
-    part: str  # of the training recordings: ``val``, held out of the fit, or ``train``
+    part: str  # part of the training recordings: ``val``, held out of the fit, or ``train``
     mse_standardised: float
     mae_counts: float
 
 
 def read_codecs(datasets: Sequence[Dataset]) -> list[StoredCodec]:
-    """Return the descriptions of the codecs among the files of ``datasets``, each one once."""
+    """Return the distinct descriptions of the codecs in the files of ``datasets``."""
     texts = dict.fromkeys(bytes(dataset.files[CODEC_FILE]) for dataset in datasets if CODEC_FILE in dataset.files)
     return [json.loads(content) for content in texts]
 
 
 def codec_series(codec: StoredCodec) -> str:
-    """Return what codecs that differ in width alone are called together.
+    """Return the common name of codecs that differ only in width.
 
     >>> codec_series({"kind": "autoencoder", "frames": 2, "of": "increments"})
     'AE-C2 increments'
@@ -54,7 +54,7 @@ def codec_series(codec: StoredCodec) -> str:
 
 
 def codec_losses(codecs: Sequence[StoredCodec]) -> list[CodecLoss]:
-    """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
+    """Return the losses of codecs by series and width, on held-out recordings if all have them, otherwise on fitted ones."""
     part = (
         "val"
         if all("val" in loss_tree["reconstruction"] for loss_tree in codecs if loss_tree.get("reconstruction"))
@@ -75,14 +75,14 @@ def codec_losses(codecs: Sequence[StoredCodec]) -> list[CodecLoss]:
 
 
 def paper_codec(codecs: Sequence[StoredCodec], series: str, latents: int) -> StoredCodec | None:
-    """Return the first codec of a series that has a covariance, the one whose width is nearest to ``latents``."""
+    """Return the codec of a series with a covariance whose width is nearest to ``latents``."""
     candidates = [
         candidate for candidate in codecs if codec_series(candidate) == series and candidate.get("latent_covariance")
     ]
     return min(candidates, key=lambda candidate: abs(int(candidate["latents"]) - latents), default=None)
 
 
-COMPONENTS = 40  # bars of the explained variance
+COMPONENTS = 40  # maximum number of bars of the explained variance
 PRINTED = {  # validation and test error in Table 1 of the paper
     "raw": (0.0484, 0.0552),
     "AE-C1": (0.0330, 0.0403),
@@ -104,12 +104,12 @@ class Representation:
 
     validation: Spread
     test: Spread
-    known: Spread | None  # test recordings of known objects alone
+    known: Spread | None  # only test recordings of known objects
     persistence: Spread
 
 
 def representation_folds(context: Context) -> list[Fold]:
-    """Return the recurrent model on each representation, and codecs' variance, covariance and loss."""
+    """Return the results of the recurrent model on each representation, and codecs' variance, covariance and loss."""
     codecs = read_codecs([*(run.dataset for run in context.runs), *context.others])
     published = context.published or (
         not context.runs and all(is_published(result, methods.ForwardResult.SETS) for result in context.bare)
@@ -124,7 +124,7 @@ def representation_folds(context: Context) -> list[Fold]:
 
 
 def represent_method(method: Method) -> Representation | None:
-    """Return a method's errors in its own scaled space, or None if the results do not state them."""
+    """Return a method's errors in its own scaled space, or None if the results do not contain them."""
 
     def error(run: ComparedRun, predictor: str, known_objects: bool | None = None) -> float | None:
         steps = run.details.errors.steps
@@ -138,7 +138,7 @@ def represent_method(method: Method) -> Representation | None:
     tested, known_objects = over(MODEL), over(MODEL, True)
     if not tested:
         return None
-    # the recurrent model is trained by this very error, so its loss states it too
+    # the recurrent model is trained with this error, so its loss is a result, too
     validation = [run.details.config.get("validation", {}) for run in method.runs]
     described = [
         tree.get("mse_feature", tree.get("loss") if methods.is_recurrent(method) else None) for tree in validation
@@ -152,7 +152,7 @@ def represent_method(method: Method) -> Representation | None:
 
 
 def _representation_table(context: Context) -> Table | None:
-    """Return the recurrent model on each representation: Table 1 in the paper's form where the data are the paper's."""
+    """Return the results of the recurrent model on each representation, as in Table 1 if the data are the paper's."""
     published, order = context.published, list(PRINTED)
     recurrent_methods = [represented for represented in context.methods if methods.is_recurrent(represented)]
 

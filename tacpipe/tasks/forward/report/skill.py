@@ -41,7 +41,7 @@ def sums_of_method(
 ) -> Sums:
     """Return the sums of a method's predictor at some steps in a group of channels, by seed and recording.
 
-    Those of unseen objects are by seed and object.
+    For unseen objects, they are by seed and object.
     """
     parts = []
     for run in method.runs:
@@ -52,13 +52,13 @@ def sums_of_method(
 
 
 def at_steps(draws: AnyFloats) -> AnyFloats:
-    """Return the skill over persistence at each step and over all, from sums (draw, part) to (draw, step + 1)."""
+    """Return the skill over persistence (draw, step + 1), at each step and overall, from sums (draw, part)."""
     parts = Parts.from_sums(draws)
     return np.hstack([parts.skill, parts.mean_skill[:, None]])
 
 
 def skill_intervals(sums: Sums) -> Interval:
-    """Return the skill over persistence at each step and over all, with intervals."""
+    """Return the skill over persistence at each step and overall, with intervals."""
     return intervals.skill_of_log_ratio(pairing.value_intervals(sums, lambda draws: np.log1p(-at_steps(draws))))
 
 
@@ -73,7 +73,7 @@ def mean_absolute(sums: Sums) -> list[float]:
 
 
 def mean_squared(sums: Sums) -> float:
-    """Return the mean squared error over all steps; NaN without sums."""
+    """Return the mean squared error over all steps; NaN if there are no sums."""
     if not sums:
         return float("nan")
     total = _total(sums)
@@ -81,7 +81,7 @@ def mean_squared(sums: Sums) -> float:
 
 
 def skill_cell(intervals: Interval | None, at: int) -> Cell:
-    """Return a value with its interval; a dash where there is none."""
+    """Return a cell with a value and its interval, or a dash if there is none."""
     if intervals is None:
         return Cell(NONE)
     return blocks.interval(float(intervals.mean[at]), float(intervals.low[at]), float(intervals.high[at]))
@@ -99,7 +99,7 @@ SITUATION_NOTE = (
 
 
 def situation_folds(context: Context) -> list[Fold]:
-    """Return errors and skill by situation of each method, or nothing if no result states them."""
+    """Return errors and skill by situation of each method; empty if no result has them."""
     rows: list[list[str | Cell]] = []
     for name in SITUATIONS:
         for method in context.methods:
@@ -116,9 +116,9 @@ def situation_folds(context: Context) -> list[Fold]:
 
 
 def skill_in_situation(method: Method, situation: str) -> dict[str, float] | None:
-    """Return windows, errors, skill and what part of persistence's error lies in a situation, pooled over runs.
+    """Return windows, errors, skill and the fraction of persistence's error in a situation, pooled over runs.
 
-    Skill is weighted by windows; of one run it has its interval.
+    Skill is weighted by windows; for a single run it has an interval.
     """
     trees = [run.details.metrics.situations for run in method.runs]
     selected = [part[situation] for part in trees if situation in part and "mean" in part[situation]["skill"]]
@@ -159,7 +159,7 @@ EXPLAINED = (
 
 
 def band_folds(context: Context) -> list[Fold]:
-    """Return how good quantiles are, of the results of calibrated models; nothing without any."""
+    """Return the quality of quantiles in results of calibrated models; empty if there are none."""
     runs = [run for run in context.runs if COVERAGE_FILE in run.details.dataset.files]
     if not runs:
         return []
@@ -186,9 +186,9 @@ Bands = Mapping[tuple[Any, str], Band]  # (step, predictor) -> band
 
 
 def _fresh_rows(runs: Sequence[ComparedRun]) -> pd.DataFrame:
-    """Return the sums of recordings that were not seen: one row per run, predictor, recording and step.
+    """Return the sums of recordings that the model was not trained on: one row per run, predictor, recording and step.
 
-    The column ``unit`` is what intervals are over: recordings, and objects where these are unseen.
+    The column ``unit`` has the clusters of intervals: recordings, or objects if these are unseen.
     """
     read = read_coverage([run.dataset for run in runs])
     assert read is not None, "each run has a coverage file"
@@ -198,7 +198,7 @@ def _fresh_rows(runs: Sequence[ComparedRun]) -> pd.DataFrame:
 
 
 def _coverage_chart(title: str, bands: Bands, level: float) -> Chart:
-    """Return coverage by step of each predictor, with its interval over recordings."""
+    """Return a chart of coverage by step of each predictor, with its interval over recordings."""
     lines = []
     for name in NAMES:
         coverage = {step: band.coverage for (step, predictor), band in sorted(bands.items()) if predictor == name}
@@ -211,7 +211,7 @@ def _coverage_chart(title: str, bands: Bands, level: float) -> Chart:
 
 
 def _coverage_rows(title: str, bands: Bands) -> list[Sequence[Any]]:
-    """Return the rows of the table: a predictor and step each."""
+    """Return the rows of the table, one per predictor and step."""
     rows: list[Sequence[Any]] = []
     for name in NAMES:
         for step in (step for step in SHOWN if (step, name) in bands):
@@ -222,7 +222,7 @@ def _coverage_rows(title: str, bands: Bands) -> list[Sequence[Any]]:
 
 
 def _example_charts(run: ComparedRun) -> list[Chart]:
-    """Return a forecast with its band of each recording that the evaluation kept, next to what was measured."""
+    """Return a chart with a forecast, its band and the measurement for each recording that the evaluation stored."""
     drawn = []
     for example in json.loads(run.details.dataset.files[EXAMPLES]):
         levels = sorted((int(name[1:]), name) for name in example if name.startswith("q"))
