@@ -1,9 +1,9 @@
 """Compress tactile channels to a few latents.
 
 Codecs are fitted only on the training recordings. Latents are added as columns ``z00``, ``z01``, …; all other columns
-and rows stay. The channels are those with ``quantity=tactile`` in their field metadata, minus their rest level.
-``codec.json`` and ``codec.safetensors`` contain what is needed to decode latents to counts, and the reconstruction
-error.
+and rows are unchanged. The inputs are the channels with ``quantity=tactile`` in their field metadata, minus their rest
+level. ``codec.json`` and ``codec.safetensors`` contain everything for decoding latents to counts, and the
+reconstruction error.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Representation = Annotated[Literal["levels", "increments"], StoredAs("of")]
 class Params:
     """Number and source of the latents."""
 
-    components: PositiveInt = 20  # number of latents, at most the number of channels; the paper kept 20
-    # keep as many latents as explain this fraction of the variance instead; 0: keep the number in components
+    components: PositiveInt = 20  # number of latents, at most the number of channels; 20 in the paper
+    # use as many latents as explain this fraction of the variance instead; 0: use components
     variance: Annotated[float, Range(0, below=1)] = 0.0
     # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
@@ -47,7 +47,9 @@ class AutoencoderParams:
     hidden: Annotated[str, CommaList(PositiveInt)] = ""
     # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
-    search: Annotated[int, Range(0, 12)] = 0  # networks to try under the same budget; the best is kept; 0: none
+    search: Annotated[int, Range(0, 12)] = (
+        0  # number of networks to try with the same budget; the best is used; 0: no search
+    )
     epochs: PositiveInt = 100  # maximum number of passes over the training rows
     batch: PositiveInt = 256  # rows per step of the optimiser
     learning_rate: PositiveFloat = 1e-3  # learning rate of Adam

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class Params:
     """Settings of the evaluation, which do not depend on the model."""
 
-    # recordings are unprocessed ones of live sessions: also evaluate what was published
+    # recordings are unprocessed ones of live sessions: also evaluate the published results
     live: bool = added(False)
 
 

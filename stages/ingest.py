@@ -2,7 +2,8 @@
 
 One command per format. Files of a robot or a lab (bags, MCAP, HDF5, Zarr, LeRobot, XDF) declare their streams, and a
 layout file adds what they omit; ``table`` reads a lab's own tables, which a layout file describes. The other commands
-read published datasets. ``--guess`` prints a first layout, and ``--dry-run`` describes what would be read.
+read published datasets. ``--guess`` prints a first layout, and ``--dry-run`` describes the recordings without reading
+them.
 
 Example: tacpipe ingest mcap FOLDER -o data/recordings
 """

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 BLOCK_ROWS = 1 << 14  # rows per block
-USUAL_SPEED = 0.75  # quantile of the speed in contact, most of which is the slide
+USUAL_SPEED = 0.75  # quantile of the speed in contact, which is mostly the slide
 _KEPT_WHOLE = (
     "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
     "sensor is touched and the arm moves."
@@ -65,7 +65,7 @@ class Params(StreamSelection):
     # frames to keep: middle ones; offset: those from offset_frames after the trigger; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
     frames: PositiveInt = 400  # number of rows to keep; recordings without static pressure are kept whole
-    # rows between trigger and kept frames with crop offset; the authors' files have 101
+    # rows between trigger and first selected frame with crop offset; the authors' files have 101
     offset_frames: NonNegativeInt = 101
     # number of rows around a tactile reading, odd, whose median replaces a spike; 1: never
     spike_frames: PositiveInt = 7

@@ -35,7 +35,7 @@ EVEN = 0.01  # maximum relative difference between steps that a filter for even 
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """Criteria for slip and drop in the readings of a proximity sensor that looks at the held object.
+    """Criteria for slip and drop in the readings of a proximity sensor that faces the grasped object.
 
     Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
     converted to counts with ``count_per_mm``, and never saturate. One millimetre is 8 counts on the published rig, its

@@ -98,7 +98,7 @@ class LeaveOneOut(Split):
 
     # leave-one-out: all recordings of a value
     scheme: Literal["leave-one-out"] = "leave-one-out"
-    by: str = "object"  # attribute whose values are left out one at a time
+    by: str = "object"  # attribute whose values are tested one at a time
 
 
 @dataclass(frozen=True)

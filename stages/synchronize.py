@@ -83,7 +83,7 @@ class Params(StreamSelection):
 
 @stage(version=3, reads=("master",))
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
-    """Bring the streams of each recording onto one clock.
+    """Resample the streams of each recording to one clock.
 
     Returns one table over the time that all streams cover, with masks of repeats and gaps. Streams of only images or
     text, and those of a single row, cannot be resampled and stay in the recordings. Attributes contain how far rows

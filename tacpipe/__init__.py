@@ -1,8 +1,8 @@
-"""From a tactile sensor's cable to a table of results that can be traced back to its bytes.
+"""The Python API of tacpipe, a data pipeline for robot touch.
 
-The Python API. `open` gives a `Dataset`, whose items are `Recording` objects; `run` runs a stage, as a command does;
-`load` gives a trained model; `stage` declares a stage of one's own, which returns a table, a `RecordingOutput` or a
-`Result`. Errors are `TacpipeError` and its subclasses.
+`open` returns a `Dataset`, whose items are `Recording` objects; `run` runs a stage, as a command does; `load` loads a
+trained model; `stage` declares a new stage, which returns a table, a `RecordingOutput` or a `Result`. Errors are
+`TacpipeError` and its subclasses.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Return what is imported when it is asked for: ``import tacpipe`` stays light."""
+    """Import a name of the API on first access, so that ``import tacpipe`` is fast."""
     if name in ("Dataset", "Recording"):
         from tacpipe.datasets import dataset
 
@@ -171,15 +171,15 @@ def run(
 def load(path: str | PathLike[str]) -> Any:
     """Load the model at ``path``, the output of `tacpipe train`.
 
-    ``model.predict`` takes a dataset or one of its recordings. It first runs the stages of the model that the recordings
-    lack, and returns the arrow table that ``tacpipe predict`` writes:
+    ``model.predict`` takes a dataset or one of its recordings. It first runs the model's preprocessing stages that the
+    recordings lack, and returns the arrow table that ``tacpipe predict`` writes:
 
         model = tacpipe.load("models/forward")
         table = model.predict(tacpipe.open("data/segments"))
 
     ``predict`` also takes arrays, as the class of the model describes: `ForwardModel`, `MaterialModel` or `TouchModel`.
 
-    :raises UsageError: if ``path`` holds no model.
+    :raises UsageError: if ``path`` is not a model.
     """
     from tacpipe.datasets import model_files
     from tacpipe.plugins import extras

@@ -26,10 +26,10 @@ Bools = NDArray[np.bool_]
 
 
 def from_arrow(column: pa.Array | pa.ChunkedArray) -> AnyArray:
-    """Return the values of a column (row,), as pyarrow's `to_numpy` does.
+    """Return the values of a column (row,), like pyarrow's `to_numpy`.
 
-    Numbers without nulls are views of pyarrow's buffers. pyarrow's own conversion imports pandas, which takes as long as
-    pyarrow itself.
+    Numbers without nulls are views of pyarrow's buffers. pyarrow's own conversion imports pandas, which takes as long
+    as importing pyarrow.
 
     >>> import pyarrow as pa
     >>> from_arrow(pa.array([1, 2, 3], pa.uint16())[1:])

@@ -48,13 +48,13 @@ class ShortageError(StorageError):
 
 
 class DamagedError(TacpipeError):
-    """Stored bytes are not what they were, and cannot be recomputed."""
+    """Stored bytes were damaged and cannot be recomputed."""
 
     exit_code = DAMAGED
 
 
 class LockedError(TacpipeError):
-    """Another process holds what this one waited for."""
+    """Another process still has the lock when the wait for it times out."""
 
     exit_code = LOCKED
 
@@ -66,7 +66,7 @@ class DeviceError(TacpipeError):
 
 
 class ResultWarning(UserWarning):
-    """A result is valid but probably not what was wanted, or lacks recordings that could not be read."""
+    """A result is valid but probably not the intended one, or lacks recordings that could not be read."""
 
 
 def is_input_error(error: TacpipeError) -> bool:

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
-_WIDE = ("W", "F")  # widths of East Asian letters that take two cells
+_WIDE = ("W", "F")  # widths of East Asian letters that occupy two cells
 _SHORT = reprlib.Repr()  # looks no deeper and no further than it prints, so that aliases of aliases cost nothing
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = 60
@@ -101,7 +101,7 @@ def moment(t_ns: int) -> str:
 
 
 def lines(texts: Iterable[str]) -> str:
-    """Return texts as lines, each `shown`: what a text holds adds no line."""
+    """Return texts as lines, each escaped by `shown`, so that a line break in a text does not add a line."""
     return "\n".join(shown(text) for text in texts)
 
 

@@ -44,7 +44,7 @@ COMPONENT = re.compile(r"(.+?)[_ ]?([XYZWxyzw])")
 MAX_TIME_S = 9e9  # latest time that fits in 64-bit nanoseconds
 TAXEL = re.compile(r".*?(\d+)(?:[_ .]?([xyz]))?")
 MAX_CHANNELS = 1 << 16
-MAX_DESCRIPTION_BYTES = 1 << 24  # largest size of a description
+MAX_DESCRIPTION_BYTES = 1 << 24  # maximum size of a description
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from tacpipe.arrays import AnyFloats, Floats, Indices
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp, local_points, wrist_axes
 
-UNIT_M = 0.05  # unit of length of the coefficients, which gives them similar magnitudes
+UNIT_M = 0.05  # unit of length of the coefficients, chosen so that they have similar magnitudes
 EPSILON = 1e-9  # added to the mean squared gradient, for points without information about a coefficient
 
 

@@ -17,7 +17,7 @@ from tacpipe.clouds.cloud import Cloud, open3d
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 
-MAX_PLANES = 4  # number of largest planes that may be the table: a floor, walls and sides of boxes may be larger
+MAX_PLANES = 4  # number of planes that may be the table, largest first: a floor, walls and sides of boxes may be larger
 MAX_EXTENT_M = 0.4  # maximum extent of an object along any axis; published objects have at most 0.28 m
 MAX_HEIGHT_M = 0.1  # maximum height of an object above the middle of a grasp: a hand cannot lift 20 cm like that
 NOISE_DEVIATIONS = 3.0  # a point is in front of the table if it is this many standard deviations of its noise above it
@@ -137,7 +137,7 @@ def _largest_plane(points_m: Floats, limits: SegmentationLimits, seed: int) -> F
         sampled = np.random.default_rng(seed).choice(points_m, MAX_PLANE_POINTS, replace=False)
     with open3d() as library:
         library.utility.random.seed(seed)
-        # probability 1 makes all trials: with fewer, the result would depend on the number of threads
+        # with a probability of 1 all trials are made; otherwise the result would depend on the number of threads
         plane, _ = _cloud(library, sampled).segment_plane(limits.plane_m, 3, limits.plane_trials, probability=1.0)
     normalised = np.asarray(plane, dtype=np.float64)
     normalised /= np.linalg.norm(normalised[:3])

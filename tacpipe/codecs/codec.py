@@ -130,7 +130,7 @@ class FittedCodec(Codec, Protocol):
 
 @dataclass(frozen=True)
 class Raw:
-    """The codec of a dataset that has none: each latent is a channel in counts above rest."""
+    """The codec of a dataset without latents: each channel, in counts above rest, is a latent."""
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]

@@ -49,7 +49,7 @@ class Arrays:
 
     @property
     def t_ns(self) -> Int64s | None:
-        """The times of the rows in nanoseconds, int64 (time,), or None if the stream has none or they were not read."""
+        """The times of the rows in nanoseconds, int64 (time,); None if the stream has no times or they were not read."""
         return self.by_column.get(TIME)
 
     @cached_property
@@ -82,7 +82,7 @@ class Arrays:
 class Tensors:
     """A stream of one recording as tensors: times and channels, with the types of `Arrays`."""
 
-    t_ns: torch.Tensor | None  # int64 (time,), nanoseconds, or None if the stream has none or they were not read
+    t_ns: torch.Tensor | None  # int64 (time,), nanoseconds; None if the stream has no times or they were not read
     values: torch.Tensor  # (time, channel)
     columns: tuple[str, ...]  # the channels: column names of `values`, in order
 

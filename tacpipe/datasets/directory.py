@@ -33,10 +33,10 @@ _OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}
 class DirectoryChange:
     """Planned content of a directory.
 
-    Damaged shards at the paths ``may_lack`` are left as they are, because a lost recording must not block the next one.
+    Damaged shards at the paths ``may_lack`` are not touched, because a lost recording must not block the next one.
     If a dataset was only ``relabelled``, nothing is removed and no shard is checked, so a label costs only its change.
     If it was found ``whole``, existing files are not checked again. Edited files of an export raise an error unless
-    ``replace`` is set, which keeps their content in the store. ``key`` names the run that produced the manifest.
+    ``replace`` is set, which stores their content. ``key`` is that of the run that produced the manifest.
     """
 
     manifest: Manifest
@@ -113,11 +113,11 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     removed: set[str] = set()
     if current or (
         manifest.exported and not relabelled
-    ):  # files of an export are large copies, so correct ones are kept
+    ):  # files of an export are large copies, so correct ones are not written again
         stale = dict(_stale(store, manifest, directory))
     if not current and relabelled:
         stale, removed = _compare_pages(_current_manifest(directory), manifest, directory)
-    elif not current:  # existing files are kept, so a new recording costs only itself
+    elif not current:  # existing files are not written again, so the cost depends only on new recordings
         before = _current_manifest(directory)
         unlike, removed = _compare_files(before, manifest, directory, is_complete=planned.is_complete)
         if before is None:  # its pages have other names than those of the previous manifest
@@ -170,7 +170,7 @@ def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]
 
 
 def _edited_files(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
-    """Return the files of an export that match neither what was last written there nor an object of the store."""
+    """Return the files of an export that match neither the last written content nor an object of the store."""
     current = _current_manifest(directory)
     if not (current or manifest).exported:  # shards are links, so a difference is damage
         return []

@@ -1,7 +1,7 @@
-"""Labelled intervals of recordings, kept as one text label per kind, such as ``slip_intervals``.
+"""Labelled intervals of recordings, stored as one text label per kind, such as ``slip_intervals``.
 
-The text lists intervals in seconds since the first sample of the recording: ``1.2-1.5 4-4.2``. An empty text states that
-there is none, which differs from a missing label.
+The text lists intervals in seconds since the first sample of the recording: ``1.2-1.5 4-4.2``. An empty text means that
+there are no intervals, which differs from a missing label.
 """
 
 from __future__ import annotations

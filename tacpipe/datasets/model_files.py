@@ -71,9 +71,9 @@ def task(files: Mapping[str, bytes], place: str = "This") -> Task:
 
 
 def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> Any:
-    """Return the mapping in a JSON file. ``needed`` gives the type of required values by dotted name.
+    """Return the mapping in a JSON file. ``needed`` maps the dotted names of required values to their types.
 
-    Raises `TacpipeError` if it is not a mapping, and for missing values, wrong types and absurd sizes.
+    Raises `TacpipeError` if it is not a mapping, a value is missing or has the wrong type, or a size is absurd.
     """
     try:
         content = json.loads(files[name])

@@ -40,7 +40,7 @@ def streams_of(recording: Recording) -> dict[str, pa.Table]:
 
 
 def columns_of(recording: Recording) -> Mapping[str, pa.Table | Columns]:
-    """Return the streams as `streams_of` does; columns of separate streams are decoded when they are asked for."""
+    """Return the streams as `streams_of` does; columns of separate streams are decoded on first access."""
     if set(recording.streams) == {""}:
         return streams_of(recording)
     return {name: recording.columns(name) for name in recording.streams if name not in NO_SIGNALS}

@@ -274,7 +274,7 @@ class Pages:
 
     @classmethod
     def joined(cls, parts: Iterable[Pages]) -> Pages:
-        """Return the recordings of several parts, sorted by name, divided into pages in the usual way."""
+        """Return the recordings of several parts, sorted by name and divided into pages."""
         divided: list[Page] = []
         fresh: dict[str, bytes] = {}
         read: PageReader | None = None

@@ -1,8 +1,8 @@
 """Check the names of recordings and the paths of their files in a dataset's directory.
 
-A recording's name becomes a file and a folder name of each derived dataset. So it contains no separators or control
-characters, leaves room for an extension, and no two names of a dataset differ only in case, because some file systems
-ignore case.
+A recording's name becomes a file and a folder name in each derived dataset. So it must not contain separators or
+control characters, must be short enough for an extension, and must differ from other names not only in case, because
+some file systems ignore case.
 """
 
 from __future__ import annotations

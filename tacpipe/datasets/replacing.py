@@ -106,7 +106,7 @@ def occupant(store: Store, output: Path) -> Manifest | None:
 
 
 def former(store: Store, output: Path) -> Manifest | None:
-    """Return the manifest that was last written at ``output``, whatever is there now, or None if the store has none."""
+    """Return the manifest that was last written at ``output``, whatever is there now, or None if it is not in the store."""
     root = store.roots.get(output.absolute())
     return None if root is None else manifest_of.stored_or_none(store, root["manifest"])
 

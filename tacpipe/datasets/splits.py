@@ -37,7 +37,7 @@ class Scheme:
     test: float = 0.15  # fraction of the recordings; ignored if the scheme selects them
     seed: int = 0
     folds: int = 5  # kfold: number of folds
-    by: str = "object"  # leave-one-out: attribute whose values are left out one by one
+    by: str = "object"  # leave-one-out: attribute whose values are tested one by one
     stratify: str = ""  # comma-separated attributes whose values are spread evenly over the roles; empty for none
     apart: str = ""  # kfold: attribute whose values are divided among the folds, each unknown in one; empty for none
     repeats: int = 1  # random: number of folds, each drawn independently

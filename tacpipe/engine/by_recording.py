@@ -251,7 +251,7 @@ class ByRecording:
         other_errors = sorted({(-failure.exit_code, failure.error) for failure in bad.values() if not failure.at_fault})
         if other_errors and all(
             code == -FAILED for code, _ in other_errors
-        ):  # a failing disk gives the same error for each recording: report it once
+        ):  # a failing disk causes the same error for each recording, so it is reported once
             raise error(FAILED, other_errors[0][1])
         if not bad or (self.request.skip_bad and not other_errors):
             return

@@ -1,4 +1,4 @@
-"""Run a stage for a key: prepare its arguments from an identity, call it, and store what it returns."""
+"""Run a stage for a key: prepare its arguments from an identity, call it, and store its result."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Run a request for several folds of a split in separate processes, and estimate how long a grid of trainings takes.
+"""Run a request for several folds of a split in separate processes, and estimate the duration of a grid of trainings.
 
-The estimate times batches of the first missing training.
+The estimate is based on the duration of batches of the first missing training.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class DurationEstimate:
 
 
 def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimate | None:
-    """Return how long the missing trainings take, ``jobs`` at a time, or None if that cannot be estimated.
+    """Return the duration of the missing trainings with ``jobs`` at a time, or None if it cannot be estimated.
 
     There is no estimate if nothing is missing, if no network is trained, or if the first training fails.
     """
@@ -129,7 +129,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
 
 
 def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) -> float:
-    """Return how long ``models`` trainings take, ``at_once`` at a time, each with ``threads`` and ``each_s`` if run alone.
+    """Return the duration of ``models`` trainings, ``at_once`` at a time, each with ``threads`` and ``each_s`` alone.
 
     >>> total_s(60, 5, 1, 2, 2), total_s(60, 4, 2, 1, 2), total_s(60, 4, 2, 2, 2)
     (300.0, 120.0, 240.0)

@@ -60,7 +60,7 @@ class DatasetLineage(TypedDict):
 
 
 class DatasetIdentity(TypedDict):
-    """The part of a dataset that a key holds."""
+    """The part of a key that describes a dataset."""
 
     lineage: DatasetLineage
     recordings: Mapping[str, RecordingEntry]
@@ -68,7 +68,7 @@ class DatasetIdentity(TypedDict):
 
 
 class RolesIdentity(TypedDict):
-    """The roles in one fold of a split, as a key holds them."""
+    """The part of a key that describes the roles in one fold of a split."""
 
     roles: str  # digest of the table of the split
     fold: int

@@ -75,9 +75,9 @@ def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: Com
     must not change   raises `UsageError`                 raises `UsageError`, before anything is run
     ===============  ==================================  ==============================================
 
-    With ``--recompute-and-compare`` the result is computed and the output stays as it is. Until the result is
-    published, nothing that it is computed from is collected. If an object turns out to be damaged when it is linked,
-    the result is recomputed.
+    With ``--recompute-and-compare`` the result is computed and the output is not changed. Until the result is
+    published, its inputs are not collected. If an object turns out to be damaged when it is linked, the result is
+    recomputed.
     """
     place = _output_place(store, request)
     if (unread := place.unread(work)) is not None:

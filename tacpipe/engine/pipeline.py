@@ -1,4 +1,4 @@
-"""Run a command: determine what is needed, reuse stored results, compute the missing ones, publish the dataset."""
+"""Run a command: determine the required results, reuse stored ones, compute the missing ones, publish the dataset."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def shared_by(processes: int) -> Iterator[None]:
 
 
 def each_of(processes: int) -> dict[str, str]:
-    """Return the variables that give each of several processes its part of the cores; empty if they are already set.
+    """Return the variables that assign each of several processes its part of the cores; empty if they are already set.
 
     If each process had as many threads as there are cores, threads would wait for one another.
     """
@@ -83,7 +83,7 @@ def jobs() -> int:
 
 
 def jobs_of(commands: int) -> dict[str, str]:
-    """Return the variable that gives each of several commands its part of the cores; empty if it is already set."""
+    """Return the variable that assigns each of several commands its part of the cores; empty if it is already set."""
     return {} if JOBS in os.environ else {JOBS: str(max(1, usable_cores() // max(1, commands)))}
 
 
@@ -153,7 +153,7 @@ def describe_provenance(seconds: float) -> Provenance:
 
 
 def describe_run(summary: Summary) -> RunProvenance:
-    """Return how the results of a command or of a group of recordings were computed; ``summary`` is what it adds up to."""
+    """Return the provenance of the results of a command or a group of recordings from their ``summary``."""
     environment: Environment = describe_provenance(0.0)
     return {**environment, **summary}
 

@@ -168,14 +168,14 @@ class RequestInputs:
 
     @property
     def model(self) -> Manifest:
-        """The manifest of the input model. Raises `UsageError` where the dataset holds no model."""
+        """The manifest of the input model. Raises `UsageError` if the dataset is not a model."""
         if "model" not in self.named_datasets:
             raise UsageError(f"{self.request.name} needs a model to read.")
         return _model_manifest(self.named_datasets["model"])
 
     @property
     def initial_model(self) -> Manifest | None:
-        """The manifest of the model to begin with, if any. Raises `UsageError` where the dataset holds no model."""
+        """The manifest of the initial model, if any. Raises `UsageError` if the dataset is not a model."""
         return _model_manifest(self.named_datasets["init"]) if "init" in self.named_datasets else None
 
     @cached_property
@@ -208,7 +208,7 @@ class RequestInputs:
 
 
 def _model_manifest(dataset: Found) -> Manifest:
-    """Return the manifest of a model. Raises `UsageError` where the dataset holds none."""
+    """Return the manifest of a model. Raises `UsageError` if the dataset is not a model."""
     manifest = dataset.manifest
     if _MODEL not in manifest.files or _RESULT in manifest.files:
         raise UsageError(

@@ -1,8 +1,8 @@
 """Write a dataset card: Parquet files that any tool opens, a README.md and Croissant metadata.
 
-The folder can be uploaded as it is: ``README.md`` is a card of the Hugging Face Hub with one configuration a stream,
-``croissant.json`` describes the columns. ``data/STREAM/RECORDING.parquet`` has the rows with native rates and types and a
-column ``recording``, ``labels.parquet`` a row a recording.
+The folder can be uploaded without changes: ``README.md`` is a card of the Hugging Face Hub with one configuration per
+stream, and ``croissant.json`` describes the columns. ``data/STREAM/RECORDING.parquet`` has the rows with native rates
+and types and a column ``recording``; ``labels.parquet`` has one row per recording.
 
 Example: tacpipe export card data/recordings -o exports/card --license cc-by-4.0 --title "Slides over twenty materials"
 """

@@ -141,7 +141,7 @@ def unwritten_losses(
 ) -> list[Loss]:
     """Return a loss for each column of ``names`` that is neither carried nor named in ``losses``.
 
-    A stream of which only the time is carried becomes one loss.
+    A stream whose only carried column is the time becomes one loss.
     """
     named_losses = {(loss.stream, loss.column) for loss in losses}
     carried_streams = {stream for stream, column in carried if column != TIME}

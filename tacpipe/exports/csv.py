@@ -1,7 +1,8 @@
-"""Write recordings as CSV files, one a stream, with a layout file that reads them back.
+"""Write recordings as CSV files, one per stream, with a layout file that reads them back.
 
-`tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives the same streams: values and stamps to the bit, types,
-units, quantities and labels. ``layout.toml`` describes each column, ``labels.json`` holds the attributes of a recording.
+`tacpipe ingest table EXPORT --layout EXPORT/layout.toml` restores the same streams: bit-identical values and
+timestamps, types, units, quantities and labels. ``layout.toml`` describes each column; ``labels.json`` contains the
+attributes of each recording.
 
 Example: tacpipe export csv data/recordings -o exports/csv
 """

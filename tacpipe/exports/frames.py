@@ -89,7 +89,8 @@ def synchronized_columns(recording: Recording) -> Columns:
 def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
     """Return the columns of the frames, and ``described`` with the omitted columns added to its losses.
 
-    If the columns of recordings differ, `UsageError` is raised, or if ``common``, only those that all have are kept.
+    If the columns of recordings differ, only those that all recordings have are used if ``common``, otherwise
+    `UsageError` is raised.
     """
     (stream,) = described.streams.values()
     if not stream.differing:
@@ -178,7 +179,7 @@ def action_channels(all_channels: Sequence[Channel], stream: str) -> tuple[list[
 
 
 def common_type(columns: Columns, chosen: Sequence[Channel]) -> ArrayType:
-    """Return the smallest type that holds every value of some channels; a missing integer is NaN, so float64 holds it."""
+    """Return the smallest type for all values of some channels; a missing integer is NaN, so it requires float64."""
     return np.result_type(*(_channel_type(columns, channel) for channel in chosen))
 
 

@@ -79,7 +79,7 @@ class Params:
     rate_hz: Rate | None = None  # robomimic: synchronize to this rate first
     master: str = ""  # robomimic: stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # robomimic: stream of the actions: its targets, else its state one frame later
-    common: bool = False  # robomimic: leave out columns that not all recordings have
+    common: bool = False  # robomimic: omit columns that not all recordings have
 
     def check(self) -> None:
         """Raise `UsageError` for an option that has no effect on streams."""

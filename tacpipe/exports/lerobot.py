@@ -1,8 +1,8 @@
 """Write recordings as a LeRobot dataset (v3.0): frames at one rate, together with the recorded shards.
 
-Synchronized recordings, or any with ``--rate-hz``. The robot's streams are ``observation.state``, tactile streams
-``observation.tactile.STREAM``; clocks and masks are ``tacpipe.*``, which policies leave out. ``--actions`` names the stream
-whose targets, or next state, are ``action``. The task is ``--task``, with labels in braces. The shards as they were given,
+Recordings must be synchronized, or have ``--rate-hz``. The robot's streams are ``observation.state``, tactile streams
+``observation.tactile.STREAM``; clocks and masks are ``tacpipe.*``, which policies ignore. ``--actions`` names the
+stream whose targets, or next state, are ``action``. The task is ``--task``, with labels in braces. The original shards,
 with their own rates and types, are under ``tacpipe/``.
 
 Example: tacpipe export lerobot data/recordings -o exports/lerobot --rate-hz 50 --actions robot --task "grasp the {object}"
@@ -184,7 +184,7 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
 
 
 def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
-    """Yield what the features cannot represent of a synchronized recording."""
+    """Yield the losses of a synchronized recording in the features."""
     from tacpipe.exports import frames
 
     channels = frames.channels(columns)

@@ -32,7 +32,7 @@ class Params:
     state: Names = ""  # streams of observation.state; without it those with joints or a pose
     tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read only it
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
-    common: bool = False  # leave out columns that not all recordings have
+    common: bool = False  # omit columns that not all recordings have
     task: str = "touch"  # text of the task, with labels in braces
     robot_type: str = ""  # name of the robot in info.json
     originals: bool = True  # store the original shards under tacpipe/

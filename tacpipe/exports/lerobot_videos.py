@@ -151,7 +151,7 @@ class EpisodeVideo:
         )
 
     def losses(self, stream: str, ending: str) -> Iterator[Loss]:
-        """Yield what the video cannot represent of the stream; ``ending`` completes each reason."""
+        """Yield the losses of the stream in the video; ``ending`` completes each reason."""
         if not self.is_copied:
             yield Loss(f"its packets: frames are encoded as {self.codec.upper()}, with some loss{ending}", stream)
         if len(np.unique(self.rows)) < self.columns.num_rows or (np.diff(self.rows) == 0).any():

@@ -1,9 +1,9 @@
-"""Write recordings as MCAP files, one a recording, for Foxglove and ROS 2.
+"""Write recordings as MCAP files, one per recording, for Foxglove and ROS 2.
 
-Each stream is a topic of ROS 2 messages with one field a column in its own type, at its own rate; events are a topic too,
-labels a metadata record. Columns that make up a pose, a wrench, a twist, joint states, tactile states or an encoded image
-are written as these messages too (``--no-usual-messages`` leaves them out). Log time and header stamp are the stamps of the
-stream.
+Each stream is a topic of ROS 2 messages at its own rate, with one field per column in its own type. Events are also a
+topic, and labels are a metadata record. Columns that form a pose, a wrench, a twist, joint states, tactile states or an
+encoded image are additionally written as these messages, except with ``--no-usual-messages``. Log time and header stamp
+are the timestamps of the stream.
 
 Example: tacpipe export mcap data/recordings -o exports/mcap
 """
@@ -106,7 +106,7 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
 
 
 def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterator[_Stream]:
-    """Yield the streams that become topics; add what the messages cannot represent to ``losses``."""
+    """Yield the streams that become topics; losses in the messages are added to ``losses``."""
     import numpy as np
 
     from tacpipe.exports import ros
@@ -199,7 +199,7 @@ def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Ite
 
 
 def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
-    """Return iterators over the same values, each kept until all have read it (itertools.tee keeps 57 together)."""
+    """Return iterators over the same values, each buffered until all have read it (itertools.tee buffers 57 at a time)."""
     waiting: list[deque[Any]] = [deque() for _ in range(readers)]
 
     def read(mine: deque[Any]) -> Iterator[Any]:

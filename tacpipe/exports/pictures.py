@@ -21,7 +21,7 @@ START_CODE = b"\x00\x00\x00\x01"
 
 
 class Pictures:
-    """The frames of a stream, which are asked for block by block in the order of rows."""
+    """The frames of a stream, requested block by block in the order of rows."""
 
     def __init__(self, columns: Columns, video_format: VideoFormat) -> None:
         self._columns, self._format = columns, video_format
@@ -64,10 +64,10 @@ class Pictures:
 
 
 def parameter_sets(video_format: VideoFormat) -> tuple[bytes, int]:
-    """Return what a decoder needs before a key frame, and how many bytes state the size of a unit in a packet.
+    """Return the parameter sets that a decoder needs before a key frame, and the number of bytes of a unit's size prefix.
 
-    H.264 and H.265 lie in files with the size before each unit (ISO/IEC 14496-15), and Foxglove reads start codes
-    instead. Others and packets that have start codes need nothing: 0.
+    In files, H.264 and H.265 units have a size prefix (ISO/IEC 14496-15), but Foxglove expects start codes. The number
+    is 0 for packets with start codes and for other codecs.
     """
     extradata = video_format.extradata
     if video_format.codec not in ("h264", "hevc"):

@@ -1,10 +1,10 @@
 """Read the numeric CSV files of published data sets strictly: a wrong cell is an error with its line, never a silent NaN.
 
-`tacpipe.formats.table.text` parses the files. Here a header names all columns, each cell is a number, no value is missing,
-and rows may end in a comma. Unix seconds are read as decimal numbers: as float64, stamps of today with nine decimals would
-be rounded to 256 ns.
+`tacpipe.formats.table.text` parses the files. The header must name all columns, each cell must be a number, no value
+may be missing, and rows may end with a comma. Unix seconds are parsed as decimal numbers, because current timestamps
+with nine decimals would be rounded to 256 ns as float64.
 
-A row that was cut short is seen. A last *number* that was cut short (``0.1234`` of ``0.123456``) cannot be.
+A truncated row is detected. A truncated last *number* (``0.1234`` of ``0.123456``) cannot be detected.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class _NumericTable(TextTable):
     trailing_comma: bool = False  # True: data rows end in a comma, whether the header does or not
 
     def names(self) -> list[str]:
-        """Return the names in the header, and an empty one for the cell behind a trailing comma."""
+        """Return the names in the header, and an empty one for the cell after a trailing comma."""
         names = self.header()
         return [*names, ""] if self.trailing_comma and names[-1] else names
 
@@ -60,12 +60,12 @@ def read_csv(
 ) -> pa.Table:
     """Return ``columns`` of a numeric CSV file, in this order, as float64 or as the type ``integers``.
 
-    Other columns of the file must be numbers too, and are left out. ``trailing_comma`` is for files whose data rows end
-    in a comma, whether the header does or not. ``seconds`` names a column of unix seconds with nine decimals at most,
-    which then stands first in the table, as ``t_ns``: exact nanoseconds, int64. Blank lines hold no row. Raises
-    `TacpipeError`, naming file and line, for: an empty file, one without rows, a missing or doubled column, a row of
-    another width, a cell that is not a number, NaN unless ``allow_nan``, infinity, seconds that are not such time, and, with
-    ``integers``, a fraction or a value out of the type's range.
+    Other columns of the file must also be numbers, and are omitted. ``trailing_comma`` is for files whose data rows end
+    with a comma, whether the header does or not. ``seconds`` names a column of Unix seconds with at most nine decimals,
+    which is converted to the first column ``t_ns``, exact int64 nanoseconds. Blank lines are skipped. Raises
+    `TacpipeError` with file and line for an empty file, a file without rows, a missing or duplicate column, a row of
+    another width, a cell that is not a number, NaN unless ``allow_nan``, infinity, invalid seconds, and, with
+    ``integers``, a fraction or a value out of range.
     """
     text = _table(path, trailing_comma)
     names = text.names()
@@ -95,11 +95,11 @@ def read_header(path: Path) -> list[str]:
 
 
 def read_record(path: Path) -> dict[str, str]:
-    """Return the one data row of a CSV file as text by column name, as in the ``meta_data.csv`` of a trial.
+    """Return the only data row of a CSV file as text by column name, as in the ``meta_data.csv`` of a trial.
 
-    Such files are written by hand in part: a row that is longer than the header because someone wrote commas into the
-    column ``notes`` is put together again, empty cells at the end are dropped, and cells that are missing at the end
-    are left out. Raises `TacpipeError`, naming file and line, for any other width and for none or several data rows.
+    Such files are partly written by hand: a row that is longer than the header because of commas in the column
+    ``notes`` is joined again, empty cells at the end are dropped, and columns of missing cells at the end are omitted.
+    Raises `TacpipeError` with file and line for any other width, and if there is not exactly one data row.
     """
     text = _table(path)
     names = text.header()
@@ -122,7 +122,7 @@ def read_record(path: Path) -> dict[str, str]:
 
 
 def place(path: Path, index: int) -> str:
-    """Return the line that holds the data row ``index`` (from 0) of a CSV file, as errors name it: "line 3"."""
+    """Return the line of the data row ``index`` (from 0) of a CSV file for error messages: "line 3"."""
     return _table(path).place(index)
 
 

@@ -1,9 +1,9 @@
-"""Trials of two GelSight Mini on a Franka hand that holds, lifts and shakes an object: Incipient-Slip-Detection (BSD-2).
+"""Read trials of two GelSight Mini on a Franka hand that lifts and shakes objects: Incipient-Slip-Detection (BSD-2).
 
 Published as amitparag/Incipient-Slip-Detection. A trial is a folder ``OBJECT/exp_num_N`` with one video per sensor,
 ``camera_0.avi`` and ``camera_2.avi`` (MPEG-4, 25 frames per second, no clock), and an empty file ``slip.txt`` if the
-object slipped. A trial with a slip ends at the slip, so its length alone reveals the label: compare windows at equal
-times since the start.
+object slipped. A trial with a slip ends at the slip, so its length reveals the label: compare windows at equal times
+since the start.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class Params(StreamSelection):
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each trial below ``source`` by recording name, ``lemon-3`` for ``lemon/exp_num_3/``.
 
-    Files are named as they lie, ``lemon/exp_num_3/camera_0.avi``, so that the object is part of a key. Raises
-    `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` if two trials share a name.
+    Files have their relative paths as names, ``lemon/exp_num_3/camera_0.avi``, so that the object is part of a key.
+    Raises `TacpipeError` if ``source`` is not a folder or contains no trial, `UsageError` if two trials have the same
+    name.
     """
     return by_object(source, NAMES, "trial", example="lemon", described=tuple(VIDEOS), prefix="exp_num_")
 

@@ -1,7 +1,7 @@
 """Find and name the trials of published sets, and recognize their recordings. Imports no heavy libraries.
 
 A recording is recognized by the month in which it was recorded. The figures of a paper, and facts about the
-measurement, hold only for the published recordings, not for a lab's own recordings in the same format.
+measurement, apply only to the published recordings, not to a lab's own recordings in the same format.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ def by_object(
 ) -> dict[str, dict[str, Path]]:
     """Return the files of each folder ``OBJECT/FOLDER`` below ``source`` that has a file of ``names``, by recording name.
 
-    Recordings are named ``OBJECT-FOLDER``, without the ``prefix`` of folders; files keep their names from the object on.
+    Recordings are named ``OBJECT-FOLDER``, without the ``prefix`` of folders; files have names relative to ``source``.
     ``noun``, ``example`` (an object) and ``described`` (some of ``names``) are for errors. Raises `TacpipeError` if
-    ``source`` is not a folder or holds none, `UsageError` if two share a name.
+    ``source`` is not a folder or contains none, `UsageError` if two have the same name.
     """
     if not source.is_dir():
         raise TacpipeError(

@@ -40,7 +40,7 @@ POINTS, WITH_WRIST = 6, 15
 class Params(StreamSelection):
     """Requirements for a grasp and its cloud."""
 
-    # largest distance of a grasp point from the nearest point of the cloud
+    # maximum distance of a grasp point from the nearest point of the cloud
     beside_mm: Annotated[NonNegativeFloat, Unit("mm")] = 20.0
 
 

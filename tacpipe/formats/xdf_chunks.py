@@ -125,7 +125,7 @@ def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> 
 def _parse_regular(
     body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int
 ) -> ChunkSamples | None:
-    """Return samples of which exactly the first ``stamped`` have a timestamp, or None if the bytes do not fit this."""
+    """Return the samples if exactly the first ``stamped`` have a timestamp, or None if the bytes do not fit this."""
     full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
     bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
     if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ROBOT, MARKER, LABELS = "robot_state.csv", "marker.csv", "slip_label.csv"
 NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, LABELS, "meta_data.csv")
-ORTHONORMAL_TOLERANCE = 1e-3  # largest accepted entry of R Rᵀ - 1; recordings have less than 1e-5
+ORTHONORMAL_TOLERANCE = 1e-3  # largest accepted entry of R Rᵀ - 1; published recordings have less than 1e-5
 
 
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:

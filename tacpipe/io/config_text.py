@@ -30,7 +30,7 @@ def load_yaml(content: str | bytes) -> Any:
     fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
     class Loader(fast):  # type: ignore[misc]
-        """Rejects a mapping with a repeated key, of which YAML's loaders use the last."""
+        """Reject a mapping with a repeated key, for which YAML's loaders use the last value."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             keys = set()

@@ -267,7 +267,7 @@ class Hashed:
 
 
 class Draft(Hashed):
-    """A new file in a store that hashes what is written to it."""
+    """A new file in a store; written bytes are hashed."""
 
     def __init__(self, path: str, root: Path | str, mode: int) -> None:
         super().__init__()

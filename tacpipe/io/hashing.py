@@ -23,7 +23,7 @@ _remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # file status and dige
 
 
 class Written(ABC):
-    """A mapping that is encoded as JSON in parts, only one of which is in memory."""
+    """A mapping that is encoded as JSON in parts, with only one part in memory."""
 
     @abstractmethod
     def written(self) -> Iterator[bytes]:
@@ -54,7 +54,7 @@ def parts(value: Any) -> Iterator[bytes]:
 
 
 def canonical(value: Any) -> bytes:
-    """Return ``value`` as canonical JSON: equal values give equal bytes everywhere.
+    """Return ``value`` as canonical JSON: equal values have equal bytes everywhere.
 
     Raises `TacpipeError` for values that JSON cannot represent, because a key must not depend on a repr or a pickle.
 

@@ -39,7 +39,7 @@ _NO_THREAD = ("can't start new thread", "Resource temporarily unavailable")
 
 
 def available() -> int:
-    """Return how many bytes this process can still allocate, limited by the computer, its container and its own limit."""
+    """Return the number of bytes that this process can still allocate, limited by the computer, its container and ulimit."""
     free_bytes = [1 << 62]
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())

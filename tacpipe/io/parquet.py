@@ -181,7 +181,7 @@ def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: i
 class ParquetTable:
     """The table in a Parquet file, whose columns are decoded on demand. Raises the errors of `from_parquet`.
 
-    The file is given as bytes or as the path of a file that does not change, of which only decoded parts are in memory.
+    The file is given as bytes, or as the path of a file that does not change; only decoded parts of it are in memory.
     Arrow buffers are read directly, Python bytes are copied.
     """
 
@@ -296,7 +296,7 @@ def owned(*pieces: bytes | memoryview) -> pa.Buffer:
 
 
 def _read_error(size: int, error: Exception) -> TacpipeError:
-    """Return the error for unreadable bytes: they are damaged, or too little memory is available to know."""
+    """Return the error for unreadable bytes: they are damaged, or there is too little memory to find out."""
     if memory.scarce() and (short := memory.shortage(error)) is not None:
         return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
@@ -381,7 +381,7 @@ def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Ta
 
 
 def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
-    """Return the concatenated tables of recordings, after a first column ``recording`` with their names, without metadata.
+    """Concatenate the tables of recordings, after a first column ``recording`` with their names, without metadata.
 
     A table that already has this column, such as a split or predictions, keeps its own. At least one table is required.
     """

@@ -123,12 +123,12 @@ class SpilledRows:
             group = following if following.num_rows else None
 
     def releasing(self, sink: Any) -> Any:
-        """Return a file that writes to ``sink`` and releases the memory of what was read for it."""
+        """Return a file that writes to ``sink`` and releases the memory that was read meanwhile."""
         return _ReleasingSink(sink, self._groups)
 
 
 class SpilledGroups:
-    """The rows of batches in tables with a fixed number of rows, of which one exists at a time.
+    """The rows of batches in tables with a fixed number of rows, one in memory at a time.
 
     Numeric columns are in a memory-mapped temporary file: `release` frees their pages, which are read again from the
     disk cache. Other columns, such as texts, stay in memory.

@@ -1,8 +1,8 @@
 """End a command with one sentence, within a second of Ctrl-C, SIGTERM or SIGHUP, whatever it is doing.
 
-Python handles a signal between two of its own instructions, and a long call in C has none. So a thread is notified too,
-and ends the process if `KeyboardInterrupt` has not. That is safe at any point, because nothing in a store is ever half
-written.
+Python handles a signal only between bytecode instructions, so not during a long call in C. So a thread is also
+notified, and ends the process if `KeyboardInterrupt` has not. That is safe at any point, because nothing in a store is
+ever partly written.
 
 SIGHUP is sent when a terminal or an ssh connection closes: by the kernel, and often again by the shell or systemd. It
 never counts as a second request. Standard output and error may be disconnected, so writing to them may fail.
@@ -136,7 +136,7 @@ def requested() -> bool:
 
 
 def report() -> None:
-    """Report that the command was interrupted, and what was kept."""
+    """Report that the command was interrupted, and what was saved."""
     sentence, _program.sentence, _program.reported = _program.sentence, SENTENCE, True
     if sentence:
         terminal.note(sentence)
@@ -157,7 +157,7 @@ def finish(code: int) -> int:
 
 @contextlib.contextmanager
 def reporting(sentence: str) -> Iterator[None]:
-    """Report an interrupt in the block with this sentence, which states what was kept."""
+    """Report an interrupt in the block with this sentence, which should state what was saved."""
     before, _program.sentence = _program.sentence, sentence
     try:
         yield

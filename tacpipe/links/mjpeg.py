@@ -145,7 +145,7 @@ class MjpegLink(DescriptorLink):
     def __init__(
         self, name: str, connection: socket.socket, parser: MultipartParser, images: list[tuple[Head, bytes]]
     ) -> None:
-        """Take a connection, and the images that came with the head of the response."""
+        """Wrap a connection, and the images that arrived with the head of the response."""
         super().__init__(name, connection.fileno())
         self.socket, self._parser, self._first_images = connection, parser, images
         self._last_us = 0

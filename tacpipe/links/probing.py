@@ -215,7 +215,7 @@ def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Re
         with closing(open_link(address, placeholder_sensor(baud), "probe")) as link:
             chunks = _listen(link, FIRST_S if number else BOOT_S)
         report = _report(address, chunks, baud)
-        if not chunks:  # a streaming device would give bytes at any baud rate, though wrong ones
+        if not chunks:  # a streaming device would send bytes at any baud rate, though wrong ones
             return best
         if not best.findings or (report.findings and report.findings[0].evidence > best.findings[0].evidence):
             best = report

@@ -29,7 +29,7 @@ from tacpipe.video.encoding import ENCODED_BY, JPEG_QUALITY, JpegEncoder
 
 DEVICES = Path("/dev")
 SYSFS = Path("/sys/class/video4linux")
-BUFFERS = 8  # frames that the kernel holds for us: a third of a second at 25 frames per second
+BUFFERS = 8  # frames buffered by the kernel: a third of a second at 25 frames per second
 CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 MMAP = 1  # V4L2_MEMORY_MMAP
 CAN_CAPTURE, CAN_STREAM, IS_TOUCH, HAS_DEVICE_CAPS = 0x1, 0x4000000, 0x10000000, 0x80000000
@@ -138,9 +138,9 @@ def cameras() -> list[Port]:
 
 
 def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
-    """Return the open camera at a path such as ``/dev/video0``, or the camera with this name.
+    """Open the camera at a path such as ``/dev/video0``, or the camera with this name.
 
-    Raises `DeviceError` if it is missing or busy, or cannot send what the rig file requests.
+    Raises `DeviceError` if it is missing or busy, or does not support the settings of the rig file.
     """
     path = place if place.startswith("/") else _find_device(place, name)
     try:

@@ -86,7 +86,7 @@ Places = dict[tuple[int, ...], list[Place]]
 class BatchColumns:
     """A batch as the recording will store it, without a copy, with the table interface that a causal chain needs.
 
-    A pyarrow table costs 10 us per column, and an arm has fifty columns, of which a model reads ten.
+    Creating a pyarrow table costs 10 us per column, and an arm has fifty columns, ten of which a model reads.
     """
 
     def __init__(self, batch: Batch, schema: pa.Schema, offset_ns: int, places: Places | None = None) -> None:

@@ -24,7 +24,7 @@ CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
 
 
 def live_channels(steps: Sequence[Step], layouts: Mapping[str, pa.Schema]) -> dict[str, LiveChannels]:
-    """Return the channels of each camera among the streams ``layouts``, if a model was trained behind `CHANNELS`."""
+    """Return the channels of each camera in the streams ``layouts``, if one of the model's stages is `CHANNELS`."""
     step = next((step for step in steps if step["stage"] in CHANNELS), None)
     if step is None:
         return {}

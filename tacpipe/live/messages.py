@@ -29,7 +29,7 @@ class Message:
     declaration: ClassVar[Declaration]
     seq: int
     t_ns: int  # time that it refers to, in the recording's UTC
-    cause: str  # reason why there is no answer, or what was missing for it
+    cause: str  # why there is no result, or what input it lacks
     made_from_t_ns: int  # arrival time of the newest sample used
     latency_ms: float
     skipped: int

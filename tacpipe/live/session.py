@@ -54,7 +54,7 @@ def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[],
 
 
 def lines(figures: SessionFigures) -> list[str]:
-    """Return what a session did so far in words.
+    """Return the progress of a session in words.
 
     >>> lines({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
     ...     "states": {"load": "off", "slip": "unknown"},

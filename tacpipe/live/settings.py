@@ -217,7 +217,7 @@ class LiveTask(ABC):
         """
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return what a session would publish for recordings (``predict --causal``).
+        """Return the messages that a session would publish for recordings (``predict --causal``).
 
         Raises `UsageError` if the task has no such predictions.
         """

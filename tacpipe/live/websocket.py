@@ -1,4 +1,4 @@
-"""Serve messages as JSON over websockets; no subscriber can delay the session or take its memory."""
+"""Serve messages as JSON over websockets. Subscribers can neither delay the session nor exhaust its memory."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from tacpipe.printable import excerpt
 HOST = "127.0.0.1"  # default host of the server
 TOKEN = "TACPIPE_LIVE_TOKEN"  # variable of the environment; subscribers must send its value unless it is empty
 CONNECTIONS = 32  # open at a time, subscribed or not
-QUEUED = 16  # messages that wait for a subscriber; a third of a second at 50 Hz
+QUEUED = 16  # messages queued per subscriber; a third of a second at 50 Hz
 QUEUED_BYTES = 1 << 20  # limit of their size
 SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
 BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
-# a client may send: the first for its request, then so many a second
+# limits for a client: initial messages for its request, then messages per second
 RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
 # The page comes from one file, and connects to its own server only.
 PAGE_HEADERS = {
@@ -44,7 +44,7 @@ PAGE_HEADERS = {
 }
 OPEN_S = 2.0  # limit of a handshake
 END_S = 1.0  # limit of closing all connections
-SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that goes is no error
+SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that disconnects is not an error
 SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
 
@@ -137,7 +137,7 @@ class WebsocketPublisher:
         return response
 
     async def _subscribe(self, connection: ServerConnection) -> None:
-        """Send a client the description and then what is published, until it goes."""
+        """Send a client the description and then the published messages, until it disconnects."""
         broadcast([connection], self._about)
         self._subscribers[connection] = 0
         try:

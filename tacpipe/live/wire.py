@@ -29,7 +29,7 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 
 CLOCK = "clock"  # note on all streams: offset in ns from the monotonic clock to the recording's UTC
-BEGIN = "begin"  # a recording begins; each stream's data follow after a note of its own
+BEGIN = "begin"  # start of a recording; the data of each stream follow its own note
 CONTINUE = "continue"  # precedes BEGIN: the state from which a new process continues
 END = "end"  # the recording ends
 OVERFLOW = "overflow"  # blocks were dropped because the model's process did not read them

@@ -1,7 +1,8 @@
-"""Find what is still needed in a store, and remove everything else.
+"""Find the content of a store that is still needed, and remove everything else.
 
-Needed content is not determined by a clock. A process announces an object before it checks that the object exists, and
-a collection moves objects aside before it reads the announcements. So at least one of the two notices the other.
+Whether content is needed does not depend on a clock. A process announces an object before it checks that the object
+exists, and a collection moves objects aside before it reads the announcements. So at least one of the two notices the
+other.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from tacpipe.store import layout, presence
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
-GRACE_DAYS = 14.0  # how long a root with an unreachable path is kept, and how long files stay in quarantine
+GRACE_DAYS = 14.0  # how long a root with an unreachable path, and a file in quarantine, is retained
 _DRAFT_S = 3600.0  # older drafts are abandoned
 _YOUNG_S = 60.0  # younger files are not touched
 
@@ -59,10 +60,9 @@ class LiveObjects:
 
 
 def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
-    """Return what is needed; with ``lasting``, also replaced content that cannot be recomputed.
+    """Return the needed content; with ``lasting``, also replaced content that cannot be recomputed.
 
-    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because the content that it named is then
-    unknown.
+    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because its content is then unknown.
     """
     needed, pending, replaced = LiveObjects(), [], []
     for run in store.leases.runs():  # runs are read before roots: a run that ends in between has written its root
@@ -83,7 +83,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if manifest_bytes is None and not expired:
             pending.append(root["manifest"])
-        if root["kind"] == PUSHED:  # each push is a snapshot that is kept until it is forgotten
+        if root["kind"] == PUSHED:  # each push is a snapshot that is retained until it is forgotten
             pending += [entry["manifest"] for entry in root.get("history", [])]
         elif lasting:
             replaced += [entry["manifest"] for entry in root.get("history", []) if entry["lasting"]]
@@ -332,7 +332,7 @@ def _sweep(
 ) -> None:
     """Remove drafts, leases and checkpoints of ended runs, and files that have long been in quarantine.
 
-    Quarantined files that name possible recordings are kept, unless ``doubtful`` is set.
+    Quarantined files that may contain recordings are retained, unless ``doubtful`` is set.
     """
     now_s = time.time()
     for path in layout.entries(store.root, "tmp"):

@@ -51,7 +51,7 @@ def labels(all_roots: Iterable[Root]) -> dict[tuple[str, str], str]:
 
 
 def label(root: Root, all_roots: Iterable[Root]) -> str:
-    """Return how a root of a store is named among ``all_roots``: by its path, behind its project if pushed."""
+    """Return the name of a root among ``all_roots``: its path, after its project if it was pushed."""
     if root["kind"] != PUSHED:
         return str(root["path"])
     return labels([*(candidate for candidate in all_roots if candidate["kind"] == PUSHED), root])[
@@ -93,8 +93,9 @@ def project_in(store: AnyStore, requested: str) -> Project:
 def find(store: AnyStore, requested: str, name: str, project: Project | None) -> Root:
     """Return the root that ``project`` requested: a ``PROJECT:PATH``, or a path, which is ``name`` within the project.
 
-    A path alone is one of ``project``. If that never pushed anything, it may be one of the only project that has it,
-    as on a second computer. Raises `UsageError` where none or several are meant, and names what is there.
+    A path without a project belongs to ``project``. If that project never pushed anything, the path may belong to the
+    only project that has it, as on a second computer. Raises `UsageError` with the candidates if no root or several
+    roots match.
     """
     all_roots = roots(store)
     matching = _roots_of_project(requested, all_roots) or _roots_of_name(name, all_roots, project)
@@ -118,7 +119,7 @@ def find(store: AnyStore, requested: str, name: str, project: Project | None) ->
 
 
 def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | None) -> list[Root]:
-    """Return the pushed roots that a name alone may mean for a project."""
+    """Return the pushed roots that a name without a project may refer to."""
     return [
         root for root in pushed_roots if root["path"] == name and (project is None or project_id(root) == project.id)
     ]
@@ -138,15 +139,15 @@ def refuse_newer(store: AnyStore, before: Root, seen_manifests: Collection[str |
 
 
 def lasting(store: AnyStore, manifest: str) -> bool:
-    """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
+    """Return whether a pushed manifest contains recordings or hand-set labels, or cannot be read to find out."""
     pushed_manifest = manifest_of.stored_or_none(store, manifest)
     return pushed_manifest is None or replacing.lasting(pushed_manifest)
 
 
 def forget(store: AnyStore, requested: str, *, dry_run: bool = False) -> bool:
-    """Keep no longer all snapshots of ``PROJECT:PATH``, or the one of which ``requested`` is `MIN_DIGITS` or more digits.
+    """Forget all snapshots of ``PROJECT:PATH``, or the one whose digest starts with ``requested``.
 
-    Returns whether there was any. Raises `UsageError` if several are meant.
+    At least `MIN_DIGITS` digits are required. Returns whether there was one. Raises `UsageError` if several match.
     """
     all_roots = roots(store)
     matching = _roots_of_project(requested, all_roots) or [root for root in all_roots if root["path"] == requested]
@@ -178,7 +179,7 @@ def manifests(root: Root) -> list[str]:
 
 
 def _remove_manifest(store: AnyStore, root: Root, manifest: str) -> None:
-    """Take a manifest out of a pushed root; of those that stay the newest is what a pull takes."""
+    """Remove a manifest from a pushed root; the newest remaining one is then what a pull gets."""
     if manifest not in manifests(root):
         return
     earlier = [entry for entry in root.get("history", []) if entry["manifest"] != manifest]

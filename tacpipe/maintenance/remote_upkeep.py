@@ -1,9 +1,9 @@
 """Collect and verify a store without locks, such as one in a bucket.
 
-No clock decides what is needed. A push announces objects before it looks whether they exist; a collection copies objects
-aside and deletes them before it reads the announcements. So one of the two sees the other. An announcement is removed when
-it is `GRACE_DAYS` old, by the clock of the store, and its push ends with an error. Each collection moves objects aside under
-names of its own, so several can run at once.
+Whether content is needed does not depend on a clock. A push announces objects before it checks whether they exist; a
+collection copies objects aside and deletes them before it reads the announcements. So one of the two notices the other.
+An announcement is removed when it is `GRACE_DAYS` old, by the clock of the store, and its push ends with an error. Each
+collection moves objects aside under its own names, so several can run at the same time.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def collect(
 
 
 def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str]], collected: Collected) -> None:
-    """Move objects aside, determine again what is needed, and remove what is still unneeded, records first."""
+    """Move objects aside, determine the needed objects again, and remove those that are still unneeded, records first."""
     mine = uuid.uuid4().hex
     asides = {entry.name: f"tmp/{layout.ASIDE}{Path(entry.name).name}-{mine}" for entry in surplus}
     moves = threads.map_in_threads(

@@ -1,7 +1,7 @@
-"""Remember which records of a store were sound and what they name, so that reading all of them again parses none.
+"""Cache which records of a store were sound and their references, so that reading all of them again parses none.
 
-The bytes of each record are read and hashed every time, and what is remembered belongs to the digest of these bytes. So
-damage is seen as if nothing were remembered.
+The bytes of each record are still read and hashed every time, and a cache entry belongs to the digest of these bytes.
+So damage is detected as without a cache.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from tacpipe.store.store import Store
 
 NOTE = hashlib.sha256(b"sound records").hexdigest()  # name of the file among the notes on directories
 _FORMAT = b"1"
-_FEWEST = 1000  # records; fewer are parsed about as fast as they are remembered
+_FEWEST = 1000  # minimum number of records; fewer are parsed about as fast as the cache is read
 
 
 class RecordSummary(NamedTuple):
-    """What a collection needs to know of a record; memory holds that of all records."""
+    """The properties of a record that a collection needs; those of all records are in memory."""
 
     names: str  # digests of shards and files
     irreplaceable: bool  # no stage can compute the result again
@@ -57,7 +57,7 @@ class SoundRecords:
         return _summary(self._store.read_record(key))
 
     def remember(self) -> None:
-        """Keep what was read for later commands; a store that cannot be written stays as it is."""
+        """Store the summaries for later commands; does nothing if the store is read-only."""
         if len(self._lines) < _FEWEST or self._lines == self._remembered:
             return
         body = b"".join(b"%b %b\n" % line for line in self._lines.items())

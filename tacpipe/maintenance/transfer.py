@@ -1,4 +1,4 @@
-"""Copy datasets to and from another store, in a folder or a bucket, so that CI can evaluate what a rig recorded."""
+"""Copy datasets to and from another store, in a folder or a bucket, so that CI can evaluate recordings of a rig."""
 
 from __future__ import annotations
 
@@ -70,9 +70,10 @@ def push(
 ) -> Transferred:
     """Copy datasets to the store at ``remote``: shards, files, records, and the manifests of their ancestors.
 
-    With ``ancestors``, the ancestors' shards are copied too. Existing objects in ``remote`` are compared by size, or
+    With ``ancestors``, the ancestors' shards are copied, too. Existing objects in ``remote`` are compared by size, or
     with ``verify`` by content, and replaced if they are damaged. A name there belongs to this project; with
-    ``project``, this project becomes the one with that name. Earlier pushes are kept as snapshots.
+    ``project``, this project takes over the identity of the one with that name. Earlier pushes are retained as
+    snapshots.
 
     Raises `UsageError` if another dataset was pushed under the name in between, unless ``replace`` is set, and
     `DamagedError` for a shard that is damaged here and cannot be recomputed.
@@ -142,7 +143,10 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
 def bring(
     source: AnyStore, target: Store, dataset: manifest_of.Found, transferred: Transferred, *, ancestors: bool = False
 ) -> None:
-    """Copy what a dataset of another store needs into this one, within a run of this store. Raises the errors of `push`."""
+    """Copy the required content of a dataset in another store into this one, within a run of this store.
+
+    Raises the errors of `push`.
+    """
     copying.copy(source, target, dataset, transferred, dataset_dirs=(), ancestors=ancestors, verify=False)
 
 

@@ -36,10 +36,10 @@ class _Candidate:
 
 
 def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterable[Manifest]) -> dict[str, set[str]]:
-    """Return the digests of manifests and pages among ``objects`` that must be kept, with all digests in them.
+    """Return the digests of manifests and pages among ``objects`` that must be retained, with all digests in them.
 
-    These contain recordings or labels that are neither in ``named_manifests`` nor in another kept one. A damaged
-    object that may be a manifest or a page is kept with everything it names, because its content is unknown.
+    These contain recordings or labels that are neither in ``named_manifests`` nor in another retained one. A damaged
+    object that may be a manifest or a page is retained with everything it names, because its content is unknown.
     """
     covered = {possession for manifest in named_manifests for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}

@@ -26,7 +26,7 @@ from tacpipe.metrics.intervals import Estimate
 if TYPE_CHECKING:
     import pandas as pd
 
-COVERAGE_FILE = "coverage.parquet"  # how often the bands of a calibrated model held, as `measure_bands` reads it
+COVERAGE_FILE = "coverage.parquet"  # the coverage of a calibrated model's bands, for `measure_bands`
 BINS = 10  # bins of confidence, equally wide
 MIN_PROBABILITY = 1e-12
 RANGE = 8.0  # range of the logarithm of a temperature, relative to the spread of scores

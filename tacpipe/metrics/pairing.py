@@ -2,8 +2,8 @@
 
 Errors are sums by seed and recording. An interval is computed by omitting clusters of recordings, the same for model
 and baseline, and training seeds if there are several (`tacpipe.metrics.intervals`). Selecting the best of several
-methods, or comparing with the best of several baselines, is also subject to chance: the bound of the interval that the
-selection affects is that of the maximum of as many statistics.
+methods, or comparing with the best of several baselines, is also subject to chance. So the bound of the interval that
+the selection affects is that of the maximum of the statistics.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ MAX_DILATIONS = 32  # maximum number of dilations per kernel
 MAX_CHANNELS = 9  # maximum number of channels that a kernel sums
 GOLDEN = (5**0.5 + 1) / 2  # its multiples, modulo 1, cover the unit interval evenly
 BLOCK_BYTES = 2**18  # size of one channel of a block of slides: several such arrays fit into a cache of 1 MB
-MAX_BYTE_COUNT = 255  # largest number of positions that a byte can count
+MAX_BYTE_COUNT = 255  # maximum number of positions counted in a byte
 
 
 @dataclass(frozen=True)

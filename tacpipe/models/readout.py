@@ -40,7 +40,7 @@ class Readout:
     weight: AnyFloats  # (feature, class)
     bias: AnyFloats  # (class,)
     alpha: float  # penalty of ridge regression; nearest mean: multiple of the identity added to the covariance
-    leave_one_out_error: float  # ridge regression: leave-one-out mean squared error with targets +-1; otherwise NaN
+    leave_one_out_error: float  # ridge regression: leave-one-out mean squared error with targets ±1; otherwise NaN
 
     @classmethod
     def fit(cls, features: AnyFloats, labels: Ints, shares: AnyFloats | None = None) -> Readout:

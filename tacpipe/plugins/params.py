@@ -226,7 +226,7 @@ def _convert_type(value: Any, annotation: Any, name: str, place: str) -> Any:
         raise TacpipeError(str(error)) from None
 
 
-# ---- names as they are stored
+# ---- stored names
 
 
 def _stored_as(kind: Kind, name: str) -> StoredAs:

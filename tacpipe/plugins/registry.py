@@ -189,7 +189,7 @@ def _entry_point_files(folder: str) -> list[str]:
     ending = ".dist-info" if folder.endswith("-packages") else ".egg-info"
     try:
         names = os.listdir(folder or ".")  # noqa: PTH208
-    except (FileNotFoundError, NotADirectoryError, PermissionError):  # Python ignores such a folder too
+    except (FileNotFoundError, NotADirectoryError, PermissionError):  # Python also ignores such a folder
         return []
     return [f"{folder or '.'}/{name}/entry_points.txt" for name in sorted(names) if name.endswith(ending)]
 
@@ -384,7 +384,7 @@ def load_codec(kind: str) -> Any:
 
 
 def load_encoder(name: str) -> Any:
-    """Return the function of an image encoder: it takes the path of its weights and returns a function of images.
+    """Return the function of an image encoder, which takes the path of its weights and returns a function of images.
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """

@@ -19,7 +19,10 @@ from tacpipe.recording.watch import Watch
 from tacpipe.video.images import START
 
 HOST = "127.0.0.1"
-HOSTS = (HOST, "localhost")  # a page of another site must not read the images by a name of its own
+HOSTS = (
+    HOST,
+    "localhost",
+)  # accepted host names, so that a page of another site cannot read the images through its own name
 POLL_S = 0.01  # period of looking for a new frame
 IDLE_S = 0.2  # maximum time without a frame after which the last one is sent again, which shows that a browser left
 BOUNDARY = "tacpipe-frame"
@@ -65,7 +68,7 @@ class PictureHandler(BaseHTTPRequestHandler):
     stopping: Event
 
     def do_GET(self) -> None:
-        """Send the page, or the frames of a camera until the browser leaves."""
+        """Send the page, or the frames of a camera until the browser disconnects."""
         if self.headers.get("Host", "").rpartition(":")[0] not in HOSTS:
             self.send_error(403)
             return

@@ -76,7 +76,7 @@ class CounterUnroller:
         delta = self._signed_difference(np.diff(raw, prepend=last_raw))
         elapsed_ns = np.diff(t_ns, prepend=last_ns)
         slow = elapsed_ns * 1e-9 * self.rate_hz * self.step > self.modulus / 2  # never true without a declared rate
-        if (delta[first:] == self.step).all() and not slow.any():  # the usual case: no event
+        if (delta[first:] == self.step).all() and not slow.any():  # the common case: no event
             seq = last_seq + np.arange(len(raw)) + (not first)
             self._last, self._before_reset = (int(raw[-1]), int(seq[-1]), int(t_ns[-1])), None
             empty = np.zeros(len(raw), dtype=bool)

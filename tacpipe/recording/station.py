@@ -141,7 +141,7 @@ class Station:
             self._thread.join(timeout=STOP_S)
         link, self._link = self._link, None
         if link is not None:
-            with contextlib.suppress(Exception):  # an error of one device must not leave the others open
+            with contextlib.suppress(Exception):  # an error of one device must not prevent closing the others
                 request = self.stream.sensor.closing()
                 if request:
                     link.write(request)

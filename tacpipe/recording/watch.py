@@ -160,7 +160,7 @@ class RigView:
         self._live = None
 
     def show(self, state: str) -> None:
-        """Show the figures of the streams, and ``state``, a description of what the rig is doing."""
+        """Show the figures of the streams, and ``state``, a description of the rig's activity."""
         now_s = clock.now_s()
         if self._quiet or now_s - self._shown_s < (1 / REFRESH_HZ if self._live else LINE_S):
             return

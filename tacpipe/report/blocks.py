@@ -32,7 +32,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that stay together: under a heading, or folded behind the first row."""
+    """Rows of one group: under a heading, or folded under the first row."""
 
     rows: Sequence[Row]
     title: str = ""
@@ -164,7 +164,7 @@ class ChartMark(TypedDict, total=False):
 
 
 class ChartSelection(TypedDict, total=False):
-    """A selection that a reader makes with the pointer."""
+    """A selection with the pointer."""
 
     type: str
     fields: Sequence[str]
@@ -233,7 +233,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image in JPEG, what it shows, and small text below."""
+    """A JPEG image with a description and a caption."""
 
     content: bytes
     text: str

@@ -33,8 +33,8 @@ BIAS_S = 0.1  # time that the box needs to zero its load
 class AtiNetFT(Sensor):
     """A force-torque sensor behind an ATI Net F/T box.
 
-    The box may send only decimation n-th sample. Its counter of samples is divided by n, so that both counters increase
-    by one per record.
+    If the box sends only every n-th sample (``decimation``), its counter of samples is divided by n, so that both
+    counters increase by one per record.
     """
 
     summary: ClassVar[str] = "ATI 6-axis force-torque sensors behind a Net F/T box."

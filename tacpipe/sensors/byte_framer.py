@@ -301,7 +301,7 @@ def _count_leading(good: Bools) -> int:
     return len(good) if good[first] else first
 
 
-FEW = 8  # fewer texts are checked one by one
+FEW = 8  # up to this many texts are checked one by one
 Check = Callable[[bytes], bool]
 CheckAll = Callable[[Sequence[bytes]], bool]
 

@@ -1,8 +1,8 @@
 """Cameras, such as those behind a gel. Each frame is a JPEG image, stored as received.
 
 The links (`tacpipe.links.v4l2`, `tacpipe.links.mjpeg`) return packets that start with `HEAD`. A `SETTINGS` packet
-contains what the camera reported when it was opened, as JSON; it is stored in the spool and is not a sample. A `FRAME`
-packet contains one image. A frame that is not a complete JPEG image of the expected size is a loss.
+contains the settings that the camera reported when it was opened, as JSON; it is stored in the spool and is not a
+sample. A `FRAME` packet contains one image. A frame that is not a complete JPEG image of the expected size is a loss.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def pack_frame(frame: Frame) -> bytes:
 
 
 def pack_settings(settings: Mapping[str, Any]) -> bytes:
-    """Return the packet of what a camera reported."""
+    """Return the packet for the settings that a camera reported."""
     content = json.dumps(settings).encode()
     return HEAD.pack(MAGIC, SETTINGS, len(content), 0, 0, 0) + content
 
@@ -64,7 +64,7 @@ def unpack_frame(packet: bytes) -> Frame | None:
 
 
 def unpack_settings(packet: bytes) -> dict[str, Any] | None:
-    """Return what a camera reported, None for any other packet."""
+    """Return the reported settings in a packet, or None for any other packet."""
     if packet[: len(MAGIC) + 1] != MAGIC + SETTINGS:
         return None
     try:
@@ -99,12 +99,12 @@ class Camera(Sensor):
 
     width_px: int = 0  # width of a frame; 0: as the camera is set
     height_px: int = 0  # height of a frame; 0: as the camera is set
-    rate_hz: float = 0.0  # frames a second; 0: as a V4L2 camera is set, unknown of one by HTTP
-    encoding: Literal["mjpeg", "yuyv"] = "mjpeg"  # what the camera sends; yuyv is encoded as JPEG, with some loss
+    rate_hz: float = 0.0  # frames per second; 0: the current setting of a V4L2 camera, unknown for HTTP
+    encoding: Literal["mjpeg", "yuyv"] = "mjpeg"  # format from the camera; yuyv is encoded as JPEG, with some loss
     exposure: int | None = None  # exposure time in 100 us; none: as the camera is set
     gain: int | None = None  # gain in the camera's units; none: as the camera is set
     white_balance_k: int | None = None  # colour temperature in kelvin; none: as the camera is set
-    led: int | None = None  # brightness of a DIGIT's light, 0 to 15, or 256 r + 16 g + b; none: as it is set
+    led: int | None = None  # brightness of a DIGIT's light, 0 to 15, or 256 r + 16 g + b; none: unchanged
     pixel_format: str = ""  # FFmpeg's name of the pixel format; comes from the camera
     stamps: Stamps = ""  # clock of the stamps and whether frames are numbered; comes from the camera
     read_back: str = ""  # controls as the camera reported them when it was opened; comes from the camera
@@ -118,7 +118,7 @@ class Camera(Sensor):
 
     @property
     def incomplete(self) -> bool:  # type: ignore[override]
-        """True if the camera must be asked for its format."""
+        """True if the camera must still be queried for its format."""
         return not (self.width_px and self.height_px and self.pixel_format and self.stamps)
 
     @property

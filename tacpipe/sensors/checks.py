@@ -70,7 +70,7 @@ CrcKind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]  # from polynomi
 
 
 def _crc(data: Bytes, kind: CrcKind, polynomial: int, bits: int, start: bytes) -> NDArray[np.uint32]:
-    """Return the CRC of each frame (frame,). ``start`` is the initial value, in the order in which data bytes meet it.
+    """Return the CRC of each frame (frame,). ``start`` is the initial value, in the order of data bytes.
 
     A CRC is linear: each byte contributes a value that depends only on the byte and its distance from the end. The
     contributions of all bytes are looked up at once and combined by exclusive or.

@@ -94,7 +94,7 @@ OptionValue = (
     | Mapping[str, str | float | bool]
     | Sequence[Mapping[str, str]]
 )
-Options = Mapping[str, OptionValue]  # options of a sensor, as a rig file states them
+Options = Mapping[str, OptionValue]  # options of a sensor in a rig file
 
 
 class LocalAddress(TypedDict, total=False):

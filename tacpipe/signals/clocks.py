@@ -25,7 +25,7 @@ QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 STEP_NS = 20_000_000  # smaller steps are latency: no device restarts within 20 ms
 STEP_WINDOW_NS = 2_000_000_000  # compared time on both sides of a step; stalls of a host are shorter
 STEP_WINDOW_ROWS = (16, 4096)
-MAX_STEPS = 64  # number of largest jumps that are examined as steps; more stalls may hide smaller restarts
+MAX_STEPS = 64  # maximum number of jumps examined as steps, largest first; with more stalls, small restarts are missed
 LOW = 0.1  # quantile that represents the fastest samples; robust against a few wrong timestamps
 ROUGH_LOW, ROUGH_BLOCKS, ROUGH_ROWS = 0.05, 64, 8  # quantile, number and smallest size of blocks for the first line
 EARLY_NS = 100_000.0  # smallest distance below the first line at which samples are excluded
@@ -267,7 +267,7 @@ def _map_times(segments: tuple[Segment, ...], device_ns: Times) -> Times:
 NEIGHBOURS = 3  # measurements before and after a jump that are compared to detect a reset
 # smallest number of measurements and duration from which a drift is estimated
 LINE_OFFSETS, LINE_OFFSETS_NS = 3, 10_000_000_000
-MAX_PAIRED = 512  # largest number of measurements for pairwise slopes; longer series are subsampled
+MAX_PAIRED = 512  # maximum number of measurements for pairwise slopes; longer series are subsampled
 
 
 def fit_offsets(device_ns: Times, offset_ns: Int64s) -> tuple[Segment, ...]:

@@ -14,13 +14,13 @@ from tacpipe.errors import TacpipeError
 from tacpipe.signals.repairs import repeated_rows
 from tacpipe.signals.runs import in_long_runs, latch, runs
 
-NOISE_MIN, NOISE_USUAL = 10.0, 40.0  # smallest and usual start threshold, as multiples of the noise at rest
-PEAK_MIN, PEAK_MAX = 0.05, 0.25  # smallest and largest start threshold, as fractions of the largest load
+NOISE_MIN, NOISE_USUAL = 10.0, 40.0  # minimum and default start threshold, as multiples of the noise at rest
+PEAK_MIN, PEAK_MAX = 0.05, 0.25  # minimum and maximum start threshold, as fractions of the maximum load
 NO_ROWS = "The recording has no rows, so its rest level cannot be determined."
 # Yields the channels of a recording (time, channel) in blocks of one row or more, from the first row on.
 Blocks = Callable[[], Iterable[AnyArray]]
 OFF_FRACTION = 2 / 3  # end threshold as a fraction of the start threshold
-PEAK_QUANTILE = 0.99  # quantile that counts as the largest load; robust against single wrong frames
+PEAK_QUANTILE = 0.99  # quantile that serves as the maximum load; robust against single wrong frames
 
 
 class Thresholds(NamedTuple):
@@ -233,7 +233,7 @@ class ContactLimits:
     rest_s: float  # time at the start whose median is the rest level of each finger
     on_count: float  # pressure above the rest level, in counts, at which a finger presses
     settle_s: float  # time for which all fingers must press, and duration of the averaged reading
-    settled_count: float  # largest range of a steady pressure within ``settle_s``, in counts
+    settled_count: float  # maximum range of a steady pressure within ``settle_s``, in counts
 
 
 def contact_row(pressure: Floats, t_ns: Times, limits: ContactLimits) -> int:

@@ -116,8 +116,8 @@ def quaternions_to_angles(quaternions: Floats) -> Floats:
 
 
 BLOCK_ROWS = 1 << 14  # rows of frames in memory
-TOOL_SPREAD_M = 0.005  # largest standard deviation of the position of a hand in the frame of its arm's last link
-TURN_SPREAD = 0.01  # largest standard deviation of the entries of its rotation matrix
+TOOL_SPREAD_M = 0.005  # maximum standard deviation of the position of a hand in the frame of its arm's last link
+TURN_SPREAD = 0.01  # maximum standard deviation of the entries of its rotation matrix
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from tacpipe.signals.runs import in_long_runs, in_long_runs_online, latch, runs
 
 MEDIAN_ROWS = 5
 LEVEL_ROWS = 10  # rows before and after a slip whose median is the level there
-CORNER_ROWS = 2  # largest distance of the end of a slip from the first row outside the level
+CORNER_ROWS = 2  # maximum distance of the end of a slip from the first row outside the level
 LEVEL_SIGMA = 3.0  # distance from the level within which readings rest, as a multiple of their noise
 
 

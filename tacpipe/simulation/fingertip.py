@@ -22,7 +22,7 @@ APERTURE_M = 0.0006
 CENTRE_M = 0.001 * np.array([-1.0, 0.0, -5.08])  # position of the contact on the finger
 REACH_M = 0.005  # standard deviation of the Gaussian sensitivity of electrodes
 GAIN_COUNT_N = (45.0, 3.0)  # gain of an electrode at the centre, and additional gain of all electrodes
-LEAN = 0.4  # fraction of the friction force that adds to or subtracts from the force 5 mm before or behind the centre
+LEAN = 0.4  # fraction of the friction force that is added to, or subtracted from, the force 5 mm before or after the centre
 PRESSURE_COUNT_N = 28.0  # PDC
 TRIGGER_COUNT = 40  # PDC above which the slide starts
 VIBRATION_COUNT_S_N = 25.0  # PAC per derivative of the contact force
@@ -86,6 +86,6 @@ def tare(counts: Floats) -> Counts:
 
 
 def to_counts(counts: Floats) -> Counts:
-    """Return what the sensor sends of tared counts: absolute values, rounded, within 16 bits."""
+    """Convert tared counts to the values that the sensor sends: absolute, rounded, within 16 bits."""
     rounded: Counts = np.rint(np.abs(counts)).clip(0, 65_535).astype(np.uint16)
     return rounded

@@ -1,10 +1,10 @@
 """Simulate a gel with printed markers in each finger of the pick-and-move rig, and the camera behind it.
 
-The markers take the places of taxels in `tacpipe.simulation.taxels`: the pressure on each, the part of the shear that it
-carries up to the limit of friction, and the bulge. A marker is displaced by its force over the stiffness of the gel below
-it, and draws its neighbours along. The image has dark dots at the displaced places, on a gel that three lights make
-brighter or darker where an object dents it, and the noise of a camera. Frames are JPEG images, as cameras send them. PyAV
-is imported to encode.
+The markers replace the taxels of `tacpipe.simulation.taxels`: the pressure on each, its part of the shear up to the
+friction limit, and the bulge. A marker is displaced by its force divided by the stiffness of the gel below it, and
+displaces its neighbours. The image has dark dots at the displaced positions on a gel that three lights make brighter or
+darker where an object dents it, with camera noise. Frames are JPEG images, as from cameras. PyAV is imported for
+encoding.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ NEIGHBOUR_PX = 24.0  # distance over which a displaced marker draws others along
 MARKER_PX, EDGE_PX, MARKER_DARKNESS = 5.0, 0.7, 0.6  # radius, softness of the edge, fraction of light that is lost
 PATCH_PX = 9  # half the side of the square in which a marker is drawn
 BRIGHTNESS = np.array([110.0, 120.0, 135.0], np.float32)  # red, green, blue grey levels of the untouched gel
-# direction from which the light of each colour comes (colour, xy)
+# direction of the light of each colour (colour, xy)
 LIGHTS = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]], np.float32)
 DENT_N, SHADE = 1 / 8.0, 900.0  # dent in image units per newton, and grey levels per unit of slope
 NOISE = 1.5  # standard deviation of a pixel, grey levels
-NOISE_IMAGES, NOISE_STEP = 4, 256_889  # noise is drawn for so many images; distance of its parts, a prime
+NOISE_IMAGES, NOISE_STEP = 4, 256_889  # number of images for which noise is drawn; offset of their parts, a prime
 CAMERA_STREAM = 2  # seeds of the cameras, next to those of the rig's devices
 
 
@@ -71,7 +71,7 @@ def gel_states(scene: PickScene, finger: int, true_ns: Times) -> GelStates:
     force_n = pick_and_move.touch(scene, finger, true_ns, places_m=places_m)  # (time, marker, axis)
     distance2 = ((rest_px[:, None] - rest_px) ** 2).sum(axis=2)
     coupling = np.exp(-distance2 / (2 * NEIGHBOUR_PX**2))
-    coupling /= coupling.sum(axis=0)  # what a marker passes on adds up to its force
+    coupling /= coupling.sum(axis=0)  # the contributions of a marker add up to its force
     marker_stiffness_n_m = STIFFNESS_N_M / len(rest_px)
     moved_m = np.einsum("mn,tna->tma", coupling, force_n[:, :, :2]) / marker_stiffness_n_m
     pressed = force_n[:, :, 2]
@@ -164,7 +164,7 @@ def simulate_trial(seed: int, index: int, rig: GelRig = GelRig()) -> RecordingOu
 def _video(
     states: GelStates, samples: faults.LoggedSamples, t_ns: Times, rig: GelRig, rng: np.random.Generator
 ) -> pa.RecordBatchReader:
-    """Return the frames of a camera, drawn and encoded as they are taken."""
+    """Return the frames of a camera, which are drawn and encoded on demand."""
     video_format = jpeg_format(WIDTH_PX, HEIGHT_PX, Fraction(rig.frame_rate_hz))
     camera = GelCamera(rng, rig.noise_scale)
     images = (camera.render(states, row, row) for row in range(len(t_ns)))

@@ -82,11 +82,11 @@ def _shape(family: str, rng: np.random.Generator) -> Shape:
 
 
 OPENING_M = (0.02, 0.12)  # range of the distance between the fingers
-CONE_RAD = np.deg2rad(15.0)  # largest angle between the closing direction and a normal
+CONE_RAD = np.deg2rad(15.0)  # maximum angle between the closing direction and a normal
 MARGIN_M = 0.004  # smallest distance of a contact from an edge
 DIRECTIONS = 36  # number of candidate lines
 LEAN_RAD = np.deg2rad(4.0)  # standard deviation of their angle to the table
-PITCH_RAD = np.deg2rad(20.0)  # largest angle between approach and vertical, around the closing axis
+PITCH_RAD = np.deg2rad(20.0)  # maximum angle between approach and vertical, around the closing axis
 FAR_M = 0.2  # distance from which the fingers approach
 
 
@@ -165,7 +165,7 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
 
 
 CAMERA_M = (0.9, 1.2)  # height above the table
-TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera
+TILT_RAD = np.deg2rad(8.0)  # maximum tilt of the camera
 SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # mean and standard deviation of object positions in the camera's view
 MIN_POINTS = 800  # of a cloud, as in the published set
 MAX_POSES = 100  # tried poses of an object

@@ -62,7 +62,7 @@ COMMON = 0.8  # common fraction of the variance of both fingers' log effort
 CENTRE_M = ((0.0038, 0.0), (-0.0013, 0.0))
 SIDE_M = (0.003, 0.005)  # range of the side offset of the thumb's contact
 BEND_RAD = 0.3  # angle of the last joint at the smallest opening; it is straight at the widest
-SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's pose
+SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # maximum errors of a fingertip's pose
 
 
 @dataclass(frozen=True)

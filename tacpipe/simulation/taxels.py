@@ -25,7 +25,7 @@ PITCH_M = places.USKIN_PITCH_M  # pitch of the taxels
 PAD_M = 2 * PITCH_M  # half the width of a pad, the limit of the centre of pressure
 PLACES_M = places.uskin_m()  # (taxel, axis)
 SIGMA_M = (0.004, 0.006)  # standard deviation of the Gaussian that distributes the pressure
-CENTRE_M = 0.003  # largest distance of its centre from the pad's centre along each axis
+CENTRE_M = 0.003  # maximum distance of its centre from the pad's centre along each axis
 TWIST_M_NM = 0.02  # shift of the centre of pressure per torque
 # x, y, z; chosen with `BULGE` for the standard deviations of the published recordings
 GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)
@@ -61,8 +61,8 @@ def skin(rng: np.random.Generator) -> Skin:
 def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats, places_m: Floats = PLACES_M) -> Floats:
     """Return the fraction of the normal force on each taxel (time, taxel). The fractions add up to 1.
 
-    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) the torque on it;
-    taxels lie at ``places_m`` (taxel, axis).
+    ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) the torque on it, and
+    ``places_m`` (taxel, axis) are the positions of the taxels.
     """
     moved = skin.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
@@ -110,7 +110,7 @@ def signal(skin: Skin, force_n: Floats) -> Floats:
 
 
 def forces(skin: Skin, counts: Floats) -> Floats:
-    """Return the forces on taxels (time, taxel, axis) in N that give these counts without drift and noise."""
+    """Return the forces on taxels (time, taxel, axis) in N that cause these counts without drift and noise."""
     above = np.einsum("mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, schema.TAXELS, 3) - skin.base_count)
     bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(skin.gain_count_n))
     size = (np.sqrt(1 + 4 * QUADRATIC_N * np.abs(bent)) - 1) / (2 * QUADRATIC_N)

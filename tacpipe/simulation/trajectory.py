@@ -26,7 +26,7 @@ START_M = (0.58, 0.0, 0.18)  # x and z from the published profile generator
 JERK_S = 0.03  # time in which the acceleration of a controlled profile changes
 PHASE_S = (0.16, 0.6)  # range of T for the lift and the next leg
 JOLT_S = (0.06, 0.6)  # range of T for further legs; short ones make the object slip briefly
-SPEED_M_S = 1.0  # largest V; the limit of a Panda's hand is 1.7 m/s
+SPEED_M_S = 1.0  # maximum V; the limit of a Panda's hand is 1.7 m/s
 LEG_M = (0.30, 0.15, 0.40)  # longest leg along x, y, z; the published legs have 0.30 m
 AFTER_LIFT_S = 1.5  # shortest time of a trial after the lift
 # region in which a person carries the object, relative to the start

@@ -159,7 +159,7 @@ class Bucket:
         return Entry(name, head["size"], head["last_modified"].timestamp())
 
     def list(self, folder: str) -> Iterator[Entry]:
-        """Implement `Backend.list`; other names are listed too."""
+        """Implement `Backend.list`; other names are also listed."""
         import obstore
 
         pages: Iterator[Sequence[Any]] | None = None

@@ -35,7 +35,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 class Holder(TypedDict, total=False):
-    """The process that holds a lease, as it states itself; another program may have written anything."""
+    """The process that holds a lease, as it describes itself; another program may have written anything."""
 
     host: str
     pid: int
@@ -43,7 +43,7 @@ class Holder(TypedDict, total=False):
     since_s: int  # seconds of UTC since 1970
     what: str  # its work
     manifests: list[str]  # digests of the manifests that it reads
-    keys: list[str]  # keys that it makes
+    keys: list[str]  # keys of the results that it computes
 
 
 @dataclass

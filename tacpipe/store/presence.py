@@ -303,7 +303,7 @@ class Look:
             return False
 
     def _lists_inodes(self, rows: Sequence[Row]) -> bool:
-        """Return whether listing the directory gives the inodes of its files, which is not the case on every file system."""
+        """Return whether listing the directory shows the inodes of its files, which is not the case on every file system."""
         return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
 
     def _settled_states(self) -> Callable[[State | None], State | None]:
@@ -316,7 +316,10 @@ class Look:
         return lambda state: state if state is not None and max(state[-2:]) < before_ns else None
 
     def _clock_ns(self) -> int:
-        """Return the time by the file system's clock. Raises `TacpipeError` if a change leaves no time in its folder."""
+        """Return the time of the file system's clock.
+
+        Raises `TacpipeError` if changes do not update the time of a folder.
+        """
         folder = self._store.root / "tmp"
         before = _state(folder)
         draft = Path(self._store.draft())

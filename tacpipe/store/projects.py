@@ -1,6 +1,7 @@
-"""The identity of a project, under which it pushes to other stores: created once and kept in the project's store.
+"""The identity of a project, under which it pushes to other stores: created once and stored in the project's store.
 
-If a folder is created anew each time, as in a continuous integration job, the environment names the project instead.
+If a folder is created again each time, as in a continuous integration job, the environment provides the identity
+instead.
 """
 
 from __future__ import annotations

@@ -21,18 +21,18 @@ _RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest
 _parse_at = json.JSONDecoder().raw_decode  # maps a text and a start to the value there and its end
 
 
-# ---- what a record holds
+# ---- the content of a record
 
 
 class Content(TypedDict):
-    """An object: a file of a dataset. The input of a key states its digest only."""
+    """An object that is a file of a dataset. Key inputs contain only its digest."""
 
     digest: str
     bytes: NotRequired[int]
 
 
 class Shard(Content):
-    """The object that holds a stream of a recording. The input of a key states its digest only."""
+    """The object of a recording's stream. Key inputs contain only its digest."""
 
     rows: NotRequired[int]
 
@@ -160,7 +160,7 @@ class Record(ComputedResult):
 def record_content(
     identity: Identity, result: StoredResult, provenance: Provenance | RunProvenance
 ) -> tuple[Record, bytes]:
-    """Return the record that ``identity`` gave ``result``, with digests of itself, and how it is kept."""
+    """Return the record of the ``result`` of ``identity``, with digests of itself, as canonical JSON."""
     record: Record = {
         "identity": identity,
         "result": result,
@@ -177,9 +177,9 @@ def summary(record: Record) -> Summary:
 
 
 def parse_record(content: bytes, key: str) -> Record | None:
-    """Return the record of ``key`` that JSON holds, or None if it is damaged. Raises `ValueError` if it is not JSON.
+    """Parse the record of ``key``, or return None if it is damaged. Raises `ValueError` if it is not JSON.
 
-    The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
+    The digests of canonical JSON, as `record_content` returns it, are those of its parts, so nothing is encoded again.
     """
     begins = _RECORD.match(content)
     if begins is None:  # not canonical JSON, as records of format 1 may be
@@ -206,7 +206,7 @@ def parse_record(content: bytes, key: str) -> Record | None:
 
 
 def _after(text: str, start: int, words: str) -> int:
-    """Return where ``text`` continues after ``words``, which must stand at ``start``. Raises `ValueError`."""
+    """Return where ``text`` continues after ``words``, which must be at ``start``. Raises `ValueError`."""
     if not text.startswith(words, start):
         raise ValueError(f"{words} is missing")
     return start + len(words)

@@ -101,7 +101,7 @@ class RemoteStore:
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Protect from collection what is announced in the block, and ``manifests``, which the run reads.
+        """Protect the objects announced in the block, and ``manifests``, which the run reads, from collection.
 
         Raises `TacpipeError` after the block if a collection treated the announcement as that of a dead process.
         """

@@ -64,9 +64,8 @@ class RemoteRoots:
     ) -> bool:
         """Record that a project pushed ``manifest`` as its dataset ``name``, after ``before`` as returned by `pushed`.
 
-        Pushed versions stay in the history until they are forgotten. The ``output`` of a command is not kept as a
-        snapshot: the next output replaces it, unless it is ``lasting``. Returns False without a change if another push
-        came first.
+        Pushed versions stay in the history until they are forgotten. The ``output`` of a command is not a snapshot: the
+        next output replaces it, unless it is ``lasting``. Returns False without a change if another push came first.
         """
         is_snapshot = before is not None and not before.get("output")  # whether ``before`` is a snapshot
         same = before is not None and before["manifest"] == manifest and before.get("project") == project
@@ -96,7 +95,7 @@ class RemoteRoots:
                 self.files.delete(file)
 
     def superseded(self) -> list[str]:
-        """Return the names of versions that no push can still take for the newest: all but the last two of each root."""
+        """Return the names of versions that no push can still consider the newest: all but the last two of each root."""
         return [file for versions in self._versions().values() for _, file in versions[:-2]]
 
     def _succeed(self, root: Root) -> bool:

@@ -31,7 +31,7 @@ class RootProject(TypedDict):
 
 
 class WrittenManifest(TypedDict):
-    """A manifest that a path holds or held."""
+    """A current or previous manifest of a path."""
 
     manifest: str  # digest
     written_s: NotRequired[int]  # seconds of UTC since 1970
@@ -44,13 +44,13 @@ class EarlierManifest(WrittenManifest):
 
 
 class Root(WrittenManifest):
-    """A path, or the name under which a project pushed, and the manifest that it holds."""
+    """A path, or the name under which a project pushed, and its manifest."""
 
     path: str
     kind: str
     previous: NotRequired[str | None]  # digest of the manifest before
     history: NotRequired[list[EarlierManifest]]  # newest first
-    key: NotRequired[str]  # the run that gave the manifest, or what it was labelled in
+    key: NotRequired[str]  # the run that produced the manifest, or the key of what was labelled
     pushed: NotRequired[list[str]]  # manifests of this path that went to other stores, newest first
     project: NotRequired[RootProject]
     missing_since_s: NotRequired[int]  # when the path was first out of reach
@@ -97,7 +97,7 @@ class Roots:
         return True
 
     def pushed(self, name: str, project: str) -> Root | None:
-        """Return what the project of this id pushed as ``name``, or None."""
+        """Return the root that the project with this id pushed as ``name``, or None."""
         return self.at(self._file(PUSHED, name, project))
 
     def note_pushed(self, path: Path, manifest: str) -> None:

@@ -106,7 +106,7 @@ class Store:
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Announce to `gc` during the block what is read (``manifests`` and all they name), stored and reused."""
+        """Announce to `gc` during the block which objects are read (``manifests`` and all they name), stored and reused."""
         if self._run is not None:  # the enclosing block holds the lease
             self._run.announce(manifests)
             yield

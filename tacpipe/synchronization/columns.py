@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
 
 MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
-ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with as many readings, delayed by 10 ms
+ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
 Keep = Callable[[Any], Any]  # stores values (grid,), possibly on disk, and returns them
 BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated at once

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
-# column of the recorder with the largest possible delay of each arrival time; not a channel
+# column of the recorder with the maximum delay of each arrival time; not a channel
 UNCERTAIN = "t_uncertain_ns"
 NOT_INTERPOLATED = ("label", "time", "mask")  # quantities whose nearest sample is used
 

@@ -1,7 +1,7 @@
 """Open recordings for prediction by a model, and record the digests of its training recordings.
 
-Opened datasets pass through the stages that the model was trained behind. ``trained_on`` of a configuration maps
-recording names to digests: evaluation reports these recordings separately, and calibration refuses them.
+Opened datasets pass through the model's preprocessing stages. ``trained_on`` of a configuration maps recording names to
+digests: evaluation reports these recordings separately, and calibration rejects them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OpenedChain:
-    """The stages that a model was trained behind, with their fitted parts: those of the opened ``model``."""
+    """The preprocessing stages of the opened ``model``, with their fitted parts."""
 
     model: Dataset
 

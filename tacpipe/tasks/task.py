@@ -112,7 +112,7 @@ class Task(ABC):
 
     @abstractmethod
     def load(self, files: Files, chain: OpenedChain | None = None) -> LoadedModel:
-        """Return the model in ``files``, which may be untrusted, trained behind the stages of ``chain``."""
+        """Return the model in ``files``, which may be untrusted, with the preprocessing stages in ``chain``."""
 
     @property
     def short_names(self) -> Mapping[str, str]:

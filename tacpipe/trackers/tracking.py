@@ -42,7 +42,7 @@ class Tracker(Protocol):
         """Add the metrics of an epoch, counted from 1: losses, learning rate, and other validation metrics."""
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """End the run. ``path`` is that of the model or results with these figures, or None if there are none."""
+        """End the run. ``path`` is that of the model or results with these figures, or None without them."""
 
 
 def flat_params(nested: Json) -> dict[str, Scalar]:
@@ -193,7 +193,7 @@ class Tracking:
             self._call(option, functools.partial(tracker_client.end, path, values))
 
     def replay(self, history: bytes, model_params: Mapping[str, Scalar]) -> None:
-        """Add the missing epochs of a stored history; ``model_params`` give the learning rate."""
+        """Add the missing epochs of a stored history; ``model_params`` contain the learning rate."""
         lines = read_history(history)
         self._labelled = has_several_networks(lines)
         for line in lines[self._lines :]:
@@ -245,7 +245,7 @@ def _tree(content: bytes) -> Json:
 def track_stored(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
     """Send each dataset's params, epochs and figures to ``trackers``; return the names of the runs.
 
-    A run has the name that ``--track`` gives it, so a result that was tracked during training is the same run. Raises
+    A run has the same name as with ``--track``, so a result that was tracked during training is the same run. Raises
     `UsageError` for a dataset without epochs and figures, and for an unknown tracker.
     """
     stored = [manifest.find(path) for path in paths]

@@ -35,8 +35,8 @@ class MarkerTrack:
 def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequence[Step]) -> MarkerTrack | None:
     """Return the markers of a stream of displacements in the frames of the stream of the same name of ``video``.
 
-    Returns None if the stream holds no displacements of markers, or if ``video`` has no such frames. The markers at
-    rest are found in the first frame, as `extract markers` finds them.
+    Returns None if the stream contains no marker displacements, or ``video`` has no such frames. The markers at rest
+    are found in the first frame, as in `extract markers`.
     """
     from tacpipe.video.decoding import read_frames
     from tacpipe.video.markers import find_grid

@@ -126,7 +126,7 @@ class Dask:
     """The workers that a Dask client is connected to."""
 
     def __init__(self, client: Client, expected: int = 0) -> None:
-        """Use a client. ``expected`` is the number of workers if they do not all start at once."""
+        """Wrap a client. ``expected`` is the number of workers if they do not all start at the same time."""
         self.client, self._expected = client, expected
         self._scheduler = str(client.scheduler_info(n_workers=0)["address"])
 

@@ -155,7 +155,7 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
                 idle.append(worker)
     finally:
         for worker, life in workers.items():
-            life.close()  # ends the worker at any point; files are never left half written
+            life.close()  # ends the worker at any point; files are never partly written
             worker.close()
 
 

@@ -145,7 +145,10 @@ class Hdf5Tree:
 @contextlib.contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
     """Open an HDF5 file, which may be truncated, for reading. Raises `TacpipeError` if it is not HDF5."""
-    with regular.failing(path), regular.opened(path) as file:  # not a pipe, and what the system answers
+    with (
+        regular.failing(path),
+        regular.opened(path) as file,
+    ):  # raises an error if it is a pipe, or the system cannot read it
         size = file.seek(0, io.SEEK_END)
     try:
         file_h5 = h5py.File(path, "r", locking=False)
@@ -212,7 +215,7 @@ class _PaddedFile(io.RawIOBase):
 
 
 def _expect_there(dataset: h5py.Dataset, available: int) -> None:
-    """Raise `OSError` if bytes of an array lie behind the end of a file that is cut short: they would read as zeros."""
+    """Raise `OSError` if bytes of an array are beyond the end of a truncated file, because they would read as zeros."""
     if dataset.chunks is None:
         offset = dataset.id.get_offset()
         ends = [offset + dataset.id.get_storage_size()] if offset is not None else []
@@ -226,7 +229,7 @@ def _expect_there(dataset: h5py.Dataset, available: int) -> None:
 
 
 def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescription | str:
-    """Return an array, the path of a group, or an empty text for what is neither."""
+    """Return an array, the path of a group, or an empty string for any other member."""
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
         return ArrayDescription(

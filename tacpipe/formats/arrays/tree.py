@@ -1,7 +1,8 @@
-"""A tree of named arrays, as HDF5 and Zarr have it, and its arrays as columns, one per value of a row.
+"""A tree of named arrays, as in HDF5 and Zarr files, and its arrays as columns, one per value of a row.
 
-Columns have quantity, unit and place in the metadata of the field. Pictures are one column of bytes. Encoded ones are
-elements of their own length, or rows padded with zeros, as in ALOHA. Decoded ones are the pixels of a row of the array.
+Columns have quantity, unit and position in the metadata of the field. Pictures are one column of bytes. Encoded
+pictures are elements of variable length, or rows padded with zeros, as in ALOHA. Decoded ones are the pixels of a row
+of the array.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from tacpipe.video.images import COLOURS, PICTURE, array_format, raw_images
 from tacpipe.video.stream import VideoFormat
 
 MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
-MAX_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
+MAX_TEXT = 200  # maximum length of a text attribute; longer ones are files, such as a simulator's model
 IMAGE_SIDE = 32  # pixels that a picture has at least
 IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
 DERIVED = "derived_from"  # attribute of an array that repeats another one, with its name
 
 
-# value of an attribute: of HDF5 as h5py and numpy give it, of Zarr as JSON
+# value of an attribute: of HDF5 as returned by h5py and numpy, of Zarr as JSON
 StoredValue = str | bytes | float | bool | None | np.generic | AnyArray | list[Any] | dict[str, Any]
 StoredAttributes = Mapping[str, StoredValue]
 
@@ -81,7 +82,7 @@ class Tree(Protocol):
         """Return whether a group has this path."""
 
     def identity(self, group: str) -> Any:
-        """Return a value that identifies a group; links can give one group several paths."""
+        """Return a value that identifies a group, which may have several paths because of links."""
 
     def attributes(self, group: str) -> StoredAttributes:
         """Return the attributes of a group."""
@@ -179,7 +180,7 @@ def is_image(array: ArrayDescription) -> bool:
 
 
 def reason_left_out(array: ArrayDescription) -> str:
-    """Return why an array is not read as columns, as in "NAME …", or empty if it is.
+    """Return why an array is not read as columns, as in "NAME …", or an empty string if it is.
 
     >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("float32")))
     'holds decoded pictures (480 x 640 x 3) of float32; uint8 and, without colours, uint16 are read'

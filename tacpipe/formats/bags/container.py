@@ -201,7 +201,7 @@ def _file_ending(path: Path) -> str:
 
 
 class BagDescription(TypedDict, total=False):
-    """The description of a bag in ``metadata.yaml``, as far as it is read."""
+    """The entries of a bag's ``metadata.yaml`` that are read."""
 
     relative_file_paths: list[str]
 

@@ -15,8 +15,8 @@ LAYOUT = ("height", "width", "encoding", "is_bigendian", "step")  # columns of r
 def declare_images(content: Batched, message_type: str) -> Batched:
     """Return the rows of a topic with the quantity image at the data of image messages.
 
-    Raw images are without padding, and columns that describe them become metadata, if all of them are alike and have
-    pixels that can be decoded. Other rows stay as they are.
+    Padding is removed from raw images, and columns that describe them become metadata, if all images are equal in
+    format and can be decoded. Otherwise rows are unchanged.
     """
     name = message_type.replace(".", "/").rpartition("/")[2]
     schema = content.schema

@@ -77,7 +77,7 @@ class RosDecoder:
     types: Types
     cdr: bool
     _meaning: meanings.Meaning | None = None
-    # shapes by the first two bytes, which state the byte order
+    # shapes by the first two bytes, which contain the byte order
     _shapes: dict[bytes, list[MessageShape]] = field(default_factory=dict)
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:

@@ -46,7 +46,9 @@ class TopicConnection:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-class BagMessage(NamedTuple):  # there are millions, and a dataclass takes three times as long to make
+class BagMessage(
+    NamedTuple
+):  # a NamedTuple, because there are millions and creating dataclass instances takes three times as long
     """A message as stored in the file."""
 
     channel: int

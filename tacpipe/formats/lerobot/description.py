@@ -75,7 +75,7 @@ class EpisodeDescription:
 
 
 class InfoFile(TypedDict, total=False):
-    """The file ``info.json``, which may be damaged, as far as it is read."""
+    """The entries of ``info.json``, which may be damaged, that are read."""
 
     codebase_version: str
     fps: float

@@ -28,7 +28,7 @@ CONTAINER_VALUES = "stated"  # key of a source's values for metadata of a shared
 class Params(StreamSelection):
     """Settings that the files do not state."""
 
-    layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not state; --guess prints one
+    layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not declare; --guess prints one
 
 
 @dataclass(frozen=True)

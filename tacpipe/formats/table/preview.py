@@ -36,7 +36,7 @@ MAX_DIFFERENT = 1 << 18  # maximum number of distinct steps that are counted sep
 
 
 class Steps:
-    """How often each step between stamps came; where more than `MOST` differ, neighbours are counted as one.
+    """A histogram of the steps between timestamps; above `MOST` different steps, adjacent ones are merged.
 
     >>> steps = Steps()
     >>> steps.add(np.array([10, 10, 11, 70]))
@@ -160,7 +160,7 @@ def _measured_fields(schema: pa.Schema) -> list[pa.Field]:
 
 
 def describe_sources(layout: Layout, folder: Path, sources: Sequence[RecordingFiles], kind: str | None = None) -> str:
-    """Return a description of what would be read: recordings, labels, and the streams of the first readable recording.
+    """Return a description of the recordings, labels, and the streams of the first readable recording, for a dry run.
 
     ``kind`` is the container format whose declared streams are read if the layout has none.
     """

@@ -333,13 +333,13 @@ class Workbook:
                 )
 
     def place(self, index: int) -> str:
-        """Return the row that holds the data row ``index`` (from 0), as errors name it."""
+        """Return the sheet's row of the data row ``index`` (from 0), for error messages."""
         with self._rows() as rows:
             numbers = (number for number, _ in rows)
             return f"row {next(itertools.islice(numbers, index + self.stream.header, None))}"
 
     def _column(self, name: str, kind: pa.DataType, block: list[tuple[int, tuple[Any, ...]]], place: int) -> pa.Array:
-        """Return the cells of a column; those of stamps have the type that the sheet gives them."""
+        """Return the cells of a column; timestamps have the type of the sheet."""
         cells = [cells[place] if place < len(cells) else None for _, cells in block]
         cells = [None if isinstance(cell, str) and cell in ("", *self.stream.missing) else cell for cell in cells]
         if pa.types.is_string(kind) and any(isinstance(cell, str) for cell in cells):
@@ -360,7 +360,7 @@ class Workbook:
 
     @contextlib.contextmanager
     def _rows(self) -> Iterator[Iterator[tuple[int, tuple[Any, ...]]]]:
-        """Yield the number and the cells of each row that holds some, below the lines to skip."""
+        """Yield the number and the cells of each nonempty row below the lines to skip."""
         with extras.explain_missing("Reading .xlsx"):
             import openpyxl
         try:

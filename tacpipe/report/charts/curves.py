@@ -23,7 +23,7 @@ from tacpipe.report.blocks import (
 
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
-DIGITS = 5  # digits per number, as many as are visible
+DIGITS = 5  # digits per number; further digits are not visible
 FEW_STEPS = 12  # maximum number of integers on an axis that each have a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that no point is clipped
 
@@ -279,9 +279,9 @@ def _point_channels(base: ChartEncoding) -> ChartEncoding:
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
-    """Return a line reduced to at most about ``count`` points: the minimum and maximum of each segment, in order.
+    """Reduce a line to at most about ``count`` points: the minimum and maximum of each segment, in order.
 
-    NaN, which breaks a line, is kept if a segment contains nothing else.
+    NaN, which interrupts a line, is retained if a segment contains nothing else.
 
     >>> x, y = decimated(np.arange(1000.0), np.r_[np.zeros(500), 9.0, np.zeros(499)], 10)
     >>> len(x) <= 20, float(y.max())

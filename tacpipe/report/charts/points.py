@@ -328,7 +328,7 @@ def grid(matrix: AnyFloats, title: str) -> Spec:
             "strength": strength,
         }
         for (row, column), value in np.ndenumerate(matrix)
-        # the square root keeps small values visible next to the largest
+        # the square root makes small values visible next to the largest
         if (strength := round(math.sqrt(abs(float(value)) / largest), 2)) >= 0.01
     ]
     axis: ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}

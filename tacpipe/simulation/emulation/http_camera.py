@@ -34,11 +34,11 @@ OPENED = (
 )
 NO_STREAM = b"HTTP/1.0 404 Not Found\r\nContent-Type: text/plain\r\n\r\nThe stream is at /stream.\n"
 MAX_REQUEST_BYTES = 1 << 14
-EPOCH_NS = 1_600_000_000_000_000_000  # what the server's clock shows when the rig starts
+EPOCH_NS = 1_600_000_000_000_000_000  # time of the server's clock when the rig starts
 
 
 def complete_camera(sensor: Camera, video: str) -> Camera:
-    """Return the sensor with what the emulated camera states of itself, so that its frames can be encoded."""
+    """Return the sensor with the settings that the emulated camera reports, so that its frames can be encoded."""
     width_px, height_px, pixel_format = gel.WIDTH_PX, gel.HEIGHT_PX, "yuvj422p"
     if video:
         shape = read_shape(next(iter(_video_images(video))))
@@ -96,7 +96,7 @@ def gel_states(world: World, finger: int, t_ns: Int64s) -> gel.GelStates:
 
 
 def _video_images(path: str) -> Iterator[bytes]:
-    """Yield the frames of a video file as JPEG images: as they are in the file if they are JPEG, otherwise encoded."""
+    """Yield the frames of a video file as JPEG images, which are encoded unless they already are JPEG."""
     file = Path(path).expanduser()
     frames = files.scan(file)
     if frames.video_format.codec == "mjpeg":
@@ -118,7 +118,7 @@ class Viewer(Connection):
         self.is_open = False
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send each image as a part; bytes that are no image (a fault's) go as they are."""
+        """Send each image as a part; invalid bytes of a fault are sent unchanged."""
         if not self.is_open:
             return [0] * len(pieces)
         sent = super().send([_part(piece) for piece in pieces])
@@ -136,7 +136,7 @@ def _part(piece: bytes) -> bytes:
 
 
 class HttpCamera(Tcp):
-    """A server of images that takes any number of hosts."""
+    """An image server that accepts any number of hosts."""
 
     scheme = "mjpeg"
     kind = Viewer

@@ -94,7 +94,7 @@ class Ledger:
         return len(self._source)  # the column that is written last, because a ledger may be read while it grows
 
     def add(self, item: SentItem, due_ns: int, sent_ns: int, size: int, cause: str) -> None:
-        """Add an item of which ``size`` bytes were sent at ``sent_ns``."""
+        """Add an item and the number of its bytes, ``size``, that were sent at ``sent_ns``."""
         if cause not in UNHARMED and size:
             self.harmed[len(self)] = item.data[:size]
         self._due_ns.append(due_ns)

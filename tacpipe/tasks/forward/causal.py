@@ -62,7 +62,7 @@ class Arm:
         return aligned
 
     def _continuous(self, quaternion: Floats) -> Floats:
-        """Return the quaternion (4,) with the sign that `rotations.continuous` gives it in the whole series."""
+        """Return the quaternion (4,) with the sign that `rotations.continuous` would choose in the full series."""
         with np.errstate(divide="ignore", invalid="ignore"):
             unit = quaternion[None] / np.linalg.norm(quaternion[None], axis=1, keepdims=True)
         if self._unit is not None and (unit * self._unit).sum(axis=1)[0] < 0:

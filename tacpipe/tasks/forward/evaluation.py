@@ -181,7 +181,7 @@ class _Drawn:
         }
 
 
-KEPT_BYTES = 1 << 24  # size of predictions kept in memory; larger ones are written to disk
+KEPT_BYTES = 1 << 24  # size of predictions in memory; larger ones are written to disk
 STORED_STEPS = (1, 3, 5, 10)  # steps whose predictions are stored; the paper's figures show 3, 5 and 10
 
 
@@ -189,9 +189,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     """Return metrics, tables and predictions of a model, given as files, and of its baselines on ``recordings``.
 
     Every window without a gap counts, in contact or not. Errors in counts are relative to the tactile channels,
-    including what the codec lost. Recordings used for training or early stopping are recognized by their digests and
-    reported separately, as are objects that were trained on and others. Raises `TacpipeError` if the model cannot read
-    the recordings.
+    including the codec's loss. Recordings used for training or early stopping are recognized by their digests and
+    reported separately, as are known and other objects. Raises `TacpipeError` if the model cannot read the recordings.
     """
     forecaster = Forecaster.load(model)
     check_codec(model, recordings.files)

@@ -147,7 +147,7 @@ class Forecaster:
         return Network(self)
 
     def prepare_single(self) -> None:
-        """Build `single`, which takes a second, before a session begins and not at its first forecast."""
+        """Build `single`, which takes a second, before a session starts rather than at its first forecast."""
         _ = self.single
 
     @property
@@ -305,7 +305,7 @@ class Forecaster:
         """Return counts above rest (window, horizon, channel) for predicted features (window, horizon, feature).
 
         ``last`` (window, channel) and ``last_feature`` (window, feature) belong to the last input row. A model that
-        predicts change adds the decoded change to that row, so that it has no error from what the codec lost of it.
+        predicts change adds the decoded change to that row, so that the codec's loss in that row causes no error.
         """
         levels = codecs.decode_ahead(self.codec, features, last)
         if self.predicts_change and self.lossy:

@@ -195,7 +195,7 @@ class Track:
 
 
 def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -> TacpipeError:
-    """Return the error for recordings without a window, which names gaps that may be the cause.
+    """Return the error for recordings without a window, with gaps that may be the cause.
 
     ``beginning`` is the start of the message, such as ``The training recordings hold``.
     """

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 
 HISTORY = "history.jsonl"
-CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost no row is left out
+CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost all rows are used
 BLOCK_ROWS = 1 << 14  # rows per block
 IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk
 LINEAR = 20_000  # windows for fitting the linear baselines

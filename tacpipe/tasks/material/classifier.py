@@ -173,7 +173,7 @@ class Classifier:
     """Readers of one or more sensors that predict a slide's material; `model` adds the functions that read recordings."""
 
     def __init__(self, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> None:
-        self.chain = chain  # stages that the model was trained behind; None if unknown
+        self.chain = chain  # preprocessing stages of the model; None if unknown
         config: MaterialConfig = model_files.tree(files, CONFIG, NEEDED)
         self.config = config
         self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
@@ -199,7 +199,7 @@ class Classifier:
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
         """Return the classifier in a model's files. Raises `TacpipeError` if they are of another task.
 
-        ``chain`` contains the stages that it was trained behind, as listed in its manifest. Without it `predict` cannot
+        ``chain`` contains the model's preprocessing stages, as listed in its manifest. Without it `predict` cannot
         check that recordings passed through the same stages.
         """
         if CONFIG not in files:

@@ -187,7 +187,7 @@ class Naming:
 
     @classmethod
     def from_labels(cls, key: str, labels: Iterable[Attribute]) -> Naming:
-        """Return the naming of labels: whole numbers from 0 are kept, any others are sorted and numbered as text.
+        """Return the naming of labels: integers from 0 are used unchanged, any others are sorted and numbered as text.
 
         >>> Naming.from_labels("material", [3, 1]).names, Naming.from_labels("object", ["cup", None, "can"]).names
         ((), ('can', 'cup'))

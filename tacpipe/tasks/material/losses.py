@@ -114,7 +114,7 @@ def uses_batch(number: int, percent: int) -> bool:
     """Return whether a subsampled sensor learns from the batch with this number, from 0.
 
     The published code uses batches whose number is a multiple of 2, 4, 6 or 9 for 50, 25, 17 and 11 %, i.e. 288, 160,
-    96 and 64 of 576 slides. No multiple gives 90 %; here each tenth batch is skipped, which leaves 512.
+    96 and 64 of 576 slides. For 90 %, which is no multiple, every tenth batch is skipped here, which uses 512.
 
     >>> [32 * sum(uses_batch(i, percent) for i in range(18)) for percent in (100, 90, 50, 25, 17, 11)]
     [576, 512, 288, 160, 96, 64]

@@ -184,7 +184,7 @@ class Spectra(MaterialModelParams):
     TITLE: ClassVar[str] = "spatial spectra"
     use_validation: bool = True  # also train on validation slides; nothing is chosen by them
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
-    # metres a second of slides whose recordings have no speed
+    # metres per second of slides whose recordings have no speed
     speeds: Annotated[str, Assignments(PositiveFloat)] = "biotac=0.025,roboskin=0.05"
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
@@ -243,12 +243,12 @@ class NetworkParams(MaterialModelParams, ABC):
     """Params of all networks for slides; base class for architectures."""
 
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
-    # sensor that learns from a part of the batches alone; needs --no-shuffle
+    # sensor that learns from only a part of the batches; needs --no-shuffle
     subsample_sensor: Annotated[str, StoredAs("reduce")] = ""
     # percentage of the batches that it learns from
     subsample_percent: Annotated[Literal[100, 90, 50, 25, 17, 11], StoredAs("ratio")] = 100
-    # network in front of a sensor's, as biotac=mlp, or other=mlp for all sensors without a 6 x 10 grid; by default cnn
-    # for such a grid, else none
+    # network before a sensor's LSTM, such as biotac=mlp, or other=mlp for all sensors without a 6 x 10 grid; by default
+    # cnn for such a grid, else none
     headers: Annotated[str, Assignments(Literal["none", "mlp", "cnn"])] = ""
     hidden: PositiveInt = 90  # units of each LSTM
     # scaling of the input: none; standard: mean 0 and deviation 1 of each channel; spread: one deviation for all channels,
@@ -260,7 +260,7 @@ class NetworkParams(MaterialModelParams, ABC):
     cycle: bool = False  # raise and lower the learning rate once over all epochs
     patience: NonNegativeInt = 0  # epochs without a better validation accuracy after which training ends; 0: all epochs
     shuffle: bool = True  # other batches every epoch
-    drop_last: bool = False  # leave out the batch that is not full, in evaluation too, as the published code does
+    drop_last: bool = False  # omit the last incomplete batch, also in evaluation, as the published code does
     # weights to keep: best, of the highest validation accuracy; last, of the last epoch
     select: Literal["best", "last"] = "best"
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
@@ -341,7 +341,7 @@ class Raec(NetworkParams):
     architecture: Literal["raec"] = "raec"
     TITLE: ClassVar[str] = "RAEC"
     ALIGNS_SENSORS: ClassVar[bool] = True
-    joint: bool = True  # align the latents of unlike sensors on slides of the same material
+    joint: bool = True  # align the latents of different sensors on slides of the same material
     # sensor of the --init model whose network is frozen; the latents of the others are aligned to its own
     frozen_sensor: Annotated[str, StoredAs("known")] = ""
     # pairs of joint learning: random; fixed: drawn once; permuted: of other materials, a negative control
@@ -356,7 +356,7 @@ class Raec(NetworkParams):
     classification_weight: NonNegativeFloat = 1.0  # weight of the negative log-likelihood of classes
     alignment_weight: NonNegativeFloat = 1.0  # weight of the alignment loss between sensors
     align_from: NonNegativeInt = 20  # first epoch, from 0, in which latents are aligned
-    # fraction of latents left out of each training step; 0 as in the published code, 0.2 in the paper's text
+    # dropout of latents in training; 0 as in the published code, 0.2 in the paper's text
     dropout: Dropout = 0.0
     PRESETS: ClassVar[Presets] = {
         "paper": _PAPER_TEXT,
@@ -436,7 +436,7 @@ class XLSTM(NetworkParams):
     # x-lstm: the paper's classifier without decoder
     architecture: Literal["x-lstm"] = "x-lstm"
     TITLE: ClassVar[str] = "X-LSTM"
-    dropout: Dropout = added(0.0)  # fraction of the last state left out of each training step; 0.2 in the paper's text
+    dropout: Dropout = added(0.0)  # dropout of the last state in training; 0.2 in the paper's text
     PRESETS: ClassVar[Presets] = {"paper": _PAPER_TEXT, "quick": {"epochs": 30}}
 
     def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:

@@ -194,7 +194,7 @@ class SensorCalibration:
     def scores_by_rule(self, scores: AnyFloats, frames: Float32s) -> dict[Rule, Floats]:
         """Return `score` by rule.
 
-        ``probability`` is the log odds of the largest probability, ``distance`` minus half the squared distance to the
+        ``probability`` is the log odds of the highest probability, ``distance`` minus half the squared distance to the
         nearest class.
         """
         return {
@@ -277,7 +277,7 @@ def unpack_calibrations(content: bytes, sensors: Iterable[str]) -> dict[str, Sen
 
 
 def _log_odds(scores: AnyFloats) -> Floats:
-    """Return log(p / (1 - p)) of the largest probability p of each slide (slide,)."""
+    """Return log(p / (1 - p)) of the highest probability p of each slide (slide,)."""
     wide = scores.astype(np.float64)
     best = wide.argmax(axis=1)[:, None]
     other_scores = wide.copy()

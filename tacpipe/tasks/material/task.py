@@ -120,7 +120,7 @@ class MaterialTask(Task):
         return predict(model.files, recordings, probabilities=request.probabilities)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> MaterialModel:
-        """Return the model in ``files``, trained behind the stages of ``chain``."""
+        """Return the model in ``files`` with the preprocessing stages in ``chain``."""
         from tacpipe.tasks.material.model import MaterialModel
 
         return MaterialModel.load(files, chain)

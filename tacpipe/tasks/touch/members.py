@@ -1,6 +1,6 @@
-"""Members of a touch model, which predict a subset of the targets each, and the training of its networks.
+"""Members of a touch model, each of which predicts some of the targets, and the training of its networks.
 
-The model's prediction is the mean over members. Networks are trained on points that are sampled anew at each visit.
+The model's prediction is the mean over members. Networks are trained on points that are sampled again at each visit.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class TouchModelParams(ABC):
 
     @classmethod
     def report_names(cls, architecture: str, *, coloured: bool) -> list[str]:
-        """Return the name of a model in reports, and of its inputs if they differ from the usual ones."""
+        """Return the name of a model in reports, and of its inputs if they are not the default."""
         return [cls.TITLE or architecture, *([] if coloured else ["without colour"])]
 
     @abstractmethod
@@ -144,13 +144,13 @@ class PointNetwork(TouchModelParams, ABC):
     # one network for all targets; else one each, as in the paper
     multi_target: Annotated[bool, StoredAs("together")] = True
     networks: PositiveInt = 3  # networks of other initial weights, whose mean is the prediction
-    points: Draws = 128  # drawn of each cloud, or of each patch, anew at each visit
+    points: Draws = 128  # number of points sampled from each cloud, or patch, at each visit
     draws: Draws = 4  # draws of points over which a prediction is averaged
     # balanced: squared error in which all targets count the same; rmse of normalised values, the paper's
     loss: Literal["balanced", "rmse"] = "balanced"
     epochs: PositiveInt = 40  # passes over the training grasps
     batch: Annotated[int, Range(2)] = 16  # grasps per step of the optimiser, which normalises them by their own spread
-    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam; the peak if it goes through a cycle
+    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam; the peak if it follows a cycle
     cycle: bool = True  # raise and lower the learning rate once over all epochs
     weight_decay: NonNegativeFloat = 0.0  # fraction of each weight that is added to its gradient
     patience: NonNegativeInt = 0  # epochs without a lower validation loss after which training ends; 0: all epochs
@@ -245,7 +245,7 @@ class Pointnet(PointNetwork):
     inputs: Literal["xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose"] = "rgbcont"
     # normalisation of a cloud; minmax: of each axis; wrist: axes of the wrist
     normalisation: Literal["none", "sphere", "minmax", "wrist"] = "none"
-    # largest random rotation about each axis in training
+    # maximum random rotation about each axis in training
     rotation_deg: Annotated[float, Range(0, 180), Unit("degrees")] = 0.0
     # rotation of the wrist: as recorded, or estimated from closing axis and line of sight
     wrist: Literal["given", "estimated"] = "given"

@@ -1,8 +1,8 @@
 """Predict the tactile reading of both fingers from a cloud and a grasp, with a trained model or a baseline.
 
-What a model learned from its training objects may not hold for novel ones. So each training object is left out in turn,
-and a model of the other objects predicts it. The difference between prediction and constant is scaled by the factor
-with the least error over all left-out objects: 1 leaves a prediction unchanged, 0 replaces it by the constant.
+A model may not generalize from its training objects to novel ones. So each training object is held out in turn, and a
+model of the other objects predicts it. The difference between prediction and constant is scaled by the factor with the
+smallest error over all held-out objects: 1 does not change a prediction, 0 replaces it by the constant.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def fit_shrinkage(
     objects: Sequence[str],
     predict: Callable[[Bools], Mapping[str, Floats]],
 ) -> Shrinkage:
-    """Return the shrinkage with the least error on training objects that are left out one by one.
+    """Return the shrinkage with the smallest error on training objects that are held out one by one.
 
     ``readings`` are (grasp, value) by target, in device counts. ``predict`` gets a mask (grasp,), trains a model on
     these grasps, and returns its predictions for all others by target (other grasp, value). Raises `UsageError` if
@@ -203,7 +203,7 @@ class Predictor:
     config: TouchConfig
     members: Sequence[members.Member]
     baselines: Baselines | None
-    chain: OpenedChain | None = None  # stages that the model was trained behind; None if unknown
+    chain: OpenedChain | None = None  # preprocessing stages of the model; None if unknown
     shrinkage: Shrinkage | None = None  # shrinkage for novel objects
     quantiles: ReadingQuantiles | None = None  # None unless `tacpipe calibrate` wrote the model
 
@@ -211,7 +211,7 @@ class Predictor:
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
         """Return the model in the files that `tacpipe train touch` wrote.
 
-        ``chain`` contains the stages that it was trained behind, as listed in its manifest. Without it `predict` cannot
+        ``chain`` contains the model's preprocessing stages, as listed in its manifest. Without it `predict` cannot
         check that recordings passed through the same stages.
         """
         config: TouchConfig = model_files.tree(files, CONFIG, NEEDED)

@@ -121,7 +121,7 @@ class TouchTask(Task):
         return predict(model.files, recordings, quantiles=request.quantiles)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> TouchModel:
-        """Return the model in ``files``, trained behind the stages of ``chain``."""
+        """Return the model in ``files`` with the preprocessing stages in ``chain``."""
         from tacpipe.tasks.touch.model import TouchModel
 
         return TouchModel.load(files, chain)

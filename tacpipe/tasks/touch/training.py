@@ -184,7 +184,7 @@ def _fit_forests(
 
 
 def _best_leaf_size(rows: Floats, values: Floats, params: Trees) -> int:
-    """Return the leaf size with the least out-of-bag error."""
+    """Return the leaf size with the smallest out-of-bag error."""
     fitting = [leaf for leaf in LEAF_SIZES if 2 * leaf <= len(rows)] or LEAF_SIZES[:1]
     if len(fitting) == 1:
         return fitting[0]
@@ -272,7 +272,7 @@ def _output_scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
 
 
 def _loss_weights(group: Sequence[str]) -> Tensor:
-    """Return loss weights (value,) with mean 1 that give every target the same total weight."""
+    """Return loss weights (value,) with mean 1 for which every target has the same total weight."""
     shares = [1 / biotac_sp.width(target) for target in group for _ in range(biotac_sp.width(target))]
     weights = torch.tensor(shares)
     return weights / weights.mean()

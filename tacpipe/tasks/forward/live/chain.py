@@ -1,8 +1,8 @@
-"""A model's chain of stages, fed samples as they arrive: rows on the model's grid, latents, windows and forecasts.
+"""Run a model's chain of stages causally on samples as they arrive: grid rows, latents, windows and forecasts.
 
-Nothing here reads a clock, a file or a link: what comes out depends on the samples, their stamps and the plan alone, and
-not on how they were cut into batches. `tacpipe predict --causal` feeds a recording to the same `LiveChain`, and so gives bit
-for bit what a live session published. docs/explanation/causal.md states the rules.
+This module reads no clock, file or link. The result depends only on the samples, their timestamps and the plan, not on
+how they were divided into batches. `tacpipe predict --causal` feeds a recording to the same `LiveChain`, so it
+reproduces the messages of a live session bit for bit. docs/explanation/causal.md states the rules.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ if TYPE_CHECKING:
     from tacpipe.store.records import Step
     from tacpipe.video.channels import LiveChannels
 
-CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
+CODEC_GAP = 1.5  # periods between two rows above which a codec starts a new run, as `run_starts` does offline
 
 
 class Cause(Flag):
-    """Why there is no forecast at a grid point, or what one was made without; several may hold."""
+    """Why there is no forecast at a grid point, or what input it lacks. Flags can be combined."""
 
     NONE = 0
-    START = auto()  # a stream has not begun, or the level at rest is not yet known: no forecast
-    CONTEXT = auto()  # fewer usable rows in a row than the model's context: no forecast
-    GAP = auto()  # the newest sample of a stream is older than the chain's gap: no forecast
+    START = auto()  # a stream has not started, or the rest level is not yet known: no forecast
+    CONTEXT = auto()  # fewer successive usable rows than the model's context: no forecast
+    GAP = auto()  # the newest sample of a stream is older than the gap of the chain: no forecast
     VALUE = auto()  # a value of the row is not finite: no forecast
     SKIPPED = auto()  # a later grid point was predicted instead, on request: no forecast
-    NO_PLAN = auto()  # no planned motion: the hand was assumed to move on as it did
-    PLAN_ENDED = auto()  # the plan ends before the horizon: the hand was assumed to stay at its end
+    NO_PLAN = auto()  # no planned motion: the hand is assumed to continue its motion
+    PLAN_ENDED = auto()  # the plan ends before the horizon: the hand is assumed to stay at its end
 
 
 BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
@@ -61,42 +61,42 @@ BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
 
 @dataclass(frozen=True, slots=True)
 class GridForecast:
-    """The prediction at one grid point; each grid point has one, also where nothing can be predicted."""
+    """The result at one grid point, which may be that no forecast is possible."""
 
-    t_ns: int  # time of the grid point; step k is the time t_ns + k * period, on a uniform grid
-    made_from_t_ns: int  # stamp of the newest sample that was read, never above t_ns; 0 before the streams have begun
-    count: Float32s | None  # (horizon, channel), above rest, or None if `cause` has a flag of `BLOCKING`
-    now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
+    t_ns: int  # time of the grid point; on a uniform grid, step k is at t_ns + k * period
+    made_from_t_ns: int  # timestamp of the newest sample that was read, at most t_ns; 0 before the streams have started
+    count: Float32s | None  # (horizon, channel), above rest; None if `cause` has a flag of `BLOCKING`
+    now: Float32s | None  # (channel,), above rest at t_ns; None before the rest level is known
     cause: Cause
     gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
-    # (horizon, channel, quantile), above rest, of those asked for; None without `count`
+    # (horizon, channel, quantile), above rest, the requested ones; None without `count`
     quantiles: Float32s | None = None
 
 
 def _gap_ms(synchronize: Any, forecaster: Forecaster, stream: str) -> float:
-    """Return the age above which the newest sample of a stream is in a gap: as the model's recordings had it."""
+    """Return the age of the newest sample of a stream above which there is a gap, as in the model's recordings."""
     stored: Mapping[str, float] = forecaster.config.get("gap_ms", {})
     return float(stored.get(stream, GAP_NS / 1e6) if synchronize.gap_ms is None else synchronize.gap_ms)
 
 
 class Beginning(NamedTuple):
-    """The state since the beginning of a session that another chain needs to continue it."""
+    """The state from the start of a session that another chain needs to continue it."""
 
     origin_ns: int  # first point of the grid
-    rest: tuple[float, ...]  # level at rest of each channel
+    rest: tuple[float, ...]  # rest level of each channel
 
     def to_json(self) -> Json:
-        """Return what `from_json` reads."""
+        """Return the JSON object that `from_json` reads."""
         return self._asdict()
 
     @classmethod
     def from_json(cls, stored: Json) -> Beginning:
-        """Return the beginning that `to_json` wrote."""
+        """Return the beginning that `to_json` stored."""
         return cls(int(stored["origin_ns"]), tuple(map(float, stored["rest"])))
 
 
 class _Row(NamedTuple):
-    """One row of the grid, before the level at rest is taken off."""
+    """One row of the grid, before the rest level is subtracted."""
 
     t_ns: int
     newest_ns: int
@@ -107,11 +107,11 @@ class _Row(NamedTuple):
 
 
 class LiveChain:
-    """The stages that a model was trained behind and the model, causally; one a live session, for one thread.
+    """The preprocessing stages of a model and the model itself, causally; one per live session, for one thread.
 
-    Feed every decoded sample with `push`, and state with `advance` up to when all has come: rows and forecasts of the grid
-    points up to then are made. The order of pushes between two calls of `advance` is without effect, as long as each
-    stream's samples come in their order.
+    Pass every decoded sample to `push`, and call `advance` with the time up to which all samples have arrived: it
+    computes the rows and forecasts of the grid points up to that time. The order of pushes between two calls of
+    `advance` has no effect, as long as the samples of each stream are in order.
     """
 
     def __init__(
@@ -124,11 +124,11 @@ class LiveChain:
         quantiles: Sequence[int] = (),
         cameras: Mapping[str, LiveChannels | None] | None = None,
     ) -> None:
-        """Make a chain of parts that fit; `for_model` checks that they do."""
+        """Create a chain from compatible parts; `for_model` checks them."""
         self._targets = targets
         # Channels of streams of frames, by stream. None without the first frame of the session, to which they refer.
         self._cameras = dict(cameras or {})
-        # places of the quantiles in a band
+        # indices of the quantiles in a band
         self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
@@ -141,7 +141,9 @@ class LiveChain:
                 self._grid.continue_from(stream, levels)
         self._rolling = Rolling(forecaster, continues=beginning is not None)
         self._arm = Arm(forecaster.orientation)
-        self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
+        self._resting: list[_Row] | None = (
+            [] if beginning is None else None
+        )  # rows collected until the rest level is known
         self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
         self._plans: deque[tuple[int, list[Floats]]] = deque()  # arrival, and rows of time and pose
         self._late_plans = 0
@@ -165,23 +167,23 @@ class LiveChain:
         *,
         allow_look_ahead: bool = False,
     ) -> LiveChain:
-        """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
+        """Return the chain of a model, from its files, its preprocessing stages, and the schema of each recorded stream.
 
-        ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model; who
-        makes several chains gives the model loaded, because that and its first forecast take a second.
-        ``layouts`` holds the schemas (with field metadata) of the rig's streams, as they are recorded; ``master`` is the
-        rig file's, used where the model's stages name none. Raises `TacpipeError` if the model is not of a task that
-        runs live, was trained behind a stage that looks ahead and has no causal rule, or needs a stream or channel that
-        ``layouts`` lacks or has otherwise.
+        ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` returns for a
+        model. To create several chains, pass the loaded model, because loading it and its first forecast take a second.
+        ``layouts`` has the schemas (with field metadata) of the rig's streams, as they are recorded; ``master`` is the
+        rig file's, used if the model's stages do not have one. Raises `TacpipeError` if the model's task does not run
+        live, a stage looks ahead and has no causal rule, or a stream or channel that the model needs is missing or
+        differs in ``layouts``.
 
-        ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
-        this one predicts the same once it has read a few rows more than the model reads. Counts that had wrapped
-        around are taken as near to the level at rest as they can be.
+        ``beginning`` is that of an earlier chain of the session: the grid and the rest level are continued, so that
+        this chain predicts the same after it has read a few more rows than the model reads. Counts that had wrapped
+        around are unwrapped to the values nearest to the rest level.
 
-        ``plan_from`` names the stream of an arm whose set-points are the planned motion (`targets`), in the place
-        of the stream ``plan``. Raises `UsageError` if it has none.
+        ``plan_from`` is the stream of an arm whose set-points are the planned motion (`Targets`), instead of the stream
+        ``plan``. Raises `UsageError` if it has no set-points.
 
-        ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` if the model has none, or not these.
+        ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` if the model does not have them.
 
         Raises `TacpipeError` for a model that was trained on rows that look ahead, unless ``allow_look_ahead``.
         """
@@ -205,7 +207,7 @@ class LiveChain:
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Names of the streams that are read; others may be pushed and are ignored."""
+        """The names of the streams that are read; samples of others are ignored."""
         readings = (
             self._layout.readings if self._targets is None else {**self._layout.readings, self._targets.stream: None}
         )
@@ -213,7 +215,7 @@ class LiveChain:
 
     @property
     def waiting(self) -> tuple[str, ...]:
-        """Those of `streams` of which no sample has come; without the master's there are no grid points either."""
+        """The `streams` without a sample so far; without a sample of the master, there are no grid points."""
         return self._grid.waiting
 
     @property
@@ -223,23 +225,23 @@ class LiveChain:
 
     @property
     def rate_hz(self) -> float:
-        """Grid points a second; of a grid ``logged`` or ``fresh``, the median of training."""
+        """Grid points per second; for a ``logged`` or ``fresh`` grid, the median rate of training."""
         rate_hz = self._stages.synchronize.rate_hz
         return float(self._forecaster.config["rate_hz"] if rate_hz is None else rate_hz)
 
     @property
     def horizon(self) -> int:
-        """How many steps ahead are predicted: steps 1 to `horizon`."""
+        """The number of predicted steps, 1 to `horizon`."""
         return self._forecaster.horizon
 
     @property
     def context(self) -> int:
-        """How many rows are read."""
+        """The number of rows that are read."""
         return self._forecaster.context
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the predicted channels, such as ``xela1_taxel01_z``."""
+        """The names of the predicted channels, such as ``xela1_taxel01_z``."""
         return tuple(self._forecaster.codec.channels)
 
     @property
@@ -249,7 +251,7 @@ class LiveChain:
 
     @property
     def unit(self) -> str:
-        """Unit of the predicted channels, as ``count``."""
+        """The unit of the predicted channels, such as ``count``."""
         return str(self._forecaster.config["inputs"].get("unit", headline.COUNT))
 
     @property
@@ -259,30 +261,30 @@ class LiveChain:
 
     @property
     def reads_plan(self) -> bool:
-        """True for a model that reads planned motion."""
+        """Whether the model reads planned motion."""
         return self._forecaster.actions == "planned" and bool(self._forecaster.pose.position)
 
     @property
     def rest(self) -> Floats | None:
-        """Level at rest (channel,), None as long as it is not known."""
+        """The rest level (channel,), or None until it is known."""
         return self._rest
 
     @property
     def beginning(self) -> Beginning | None:
-        """Grid and level at rest, for a chain that continues the session; None as long as they are not known."""
+        """Grid and rest level, for a chain that continues the session; None until they are known."""
         origin_ns = self._grid.origin_ns
         return None if self._rest is None or origin_ns is None else Beginning(origin_ns, tuple(self._rest.tolist()))
 
     @property
     def late(self) -> Mapping[str, int]:
-        """How many samples of each stream came after a sample of a later stamp, or after `advance` had passed them.
+        """The number of late samples by stream, which arrived after a newer sample or after `advance` passed their time.
 
-        What was predicted meanwhile lacks them, and so differs from what `tacpipe predict --causal` gives.
+        Forecasts made meanwhile lack them, and so differ from those of `tacpipe predict --causal`.
         """
         return {**self._grid.late, **({PLAN: self._late_plans} if self.reads_plan else {})}
 
     def push(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> None:
-        """Take samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
+        """Add samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
         if self._targets is not None and stream == self._targets.stream and batch.num_rows:
             self._targets.push(batch)
         if stream == PLAN:
@@ -300,20 +302,21 @@ class LiveChain:
         self._cameras = dict(previous._cameras)
 
     def plan(self, arrived_ns: int, t_ns: Times, poses: AnyFloats) -> None:
-        """Take planned motion that arrived at ``arrived_ns``; it replaces the plan before it.
+        """Set the planned motion that arrived at ``arrived_ns``; it replaces the previous plan.
 
-        ``t_ns`` (point,) are the times, ascending, on the clock of the samples, at which the hand is to be at ``poses``
-        (point, 3 or 7): position in m and quaternion x, y, z, w in the frame of the recorded pose. Between points the
-        position is interpolated linearly and the orientation along the shorter arc. The same as pushing the rows of
-        `inputs.plan_table`, which is what a session records. Raises `TacpipeError` for other shapes.
+        ``t_ns`` (point,) are the ascending times, by the clock of the samples, at which the hand is to be at ``poses``
+        (point, 3 or 7): position in m and quaternion x, y, z, w in the frame of the recorded pose. Between points, the
+        position is interpolated linearly and the orientation along the shorter arc. This is equivalent to pushing the
+        rows of `inputs.plan_table`, which a session records. Raises `TacpipeError` for other shapes.
         """
         self._push_plans(plan_table(arrived_ns, t_ns, poses))
 
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
-        """Return the forecasts of the grid points up to ``t_ns``: the caller states that all samples up to it were pushed.
+        """Return the forecasts of the grid points up to ``t_ns``, up to which all samples must have been pushed.
 
-        A sample or plan with a stamp up to ``t_ns`` that comes later is counted in `late`. With ``newest_only``, for whom
-        has fallen behind, the newest grid point alone is predicted; the others have the cause SKIPPED.
+        A sample or plan with a timestamp up to ``t_ns`` that arrives afterwards is counted in `late`. With
+        ``newest_only``, for a caller that has fallen behind, only the newest grid point is predicted; the others have
+        the cause SKIPPED.
         """
         self._until_ns = t_ns if self._until_ns is None else max(t_ns, self._until_ns)
         rows = self._grid.rows(t_ns)
@@ -340,7 +343,7 @@ class LiveChain:
         return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
 
     def _forecast(self, row: _Row, *, skipped: bool) -> GridForecast:
-        """Return the forecast of a row, once the rows of the rest are known."""
+        """Return the forecast of a row, after the rows that determine the rest level."""
         if self._resting is not None:
             first = self._resting[0] if self._resting else row
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
@@ -366,7 +369,7 @@ class LiveChain:
         return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
 
     def _take(self, row: _Row) -> bool:
-        """Give a row to the model's window; return whether its values are finite."""
+        """Add a row to the model's window; return whether its values are finite."""
         since_ns = row.t_ns - self._times[-1] if self._times else None
         self._times.append(row.t_ns)
         assert self._rest is not None
@@ -380,9 +383,9 @@ class LiveChain:
         )
 
     def _planned_rows(self, t_ns: int) -> tuple[AnyFloats, Cause]:
-        """Return the arm's rows to come (horizon, 13), and what they were made without."""
+        """Return the arm's planned rows (horizon, 13), and the cause if the plan is missing or too short."""
         now, ahead_ns = self._rolling.arm, t_ns + self._steps_ns()
-        if not self.reads_plan:  # a model without plans puts the newest row there itself
+        if not self.reads_plan:  # a model without plans uses the newest row instead
             return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE
         if self._targets is not None:
             aimed = self._targets.state(t_ns)
@@ -398,10 +401,10 @@ class LiveChain:
         return causal.rows(plan, t_ns, ahead_ns, now), cause
 
     def _steps_ns(self) -> Times:
-        """Return the times of the rows to come after the newest one (horizon,).
+        """Return the times of the predicted rows relative to the newest one (horizon,).
 
-        Rows at the stamps of a stream follow one another as the rows of the context did, because rates differ between
-        recordings.
+        If rows are at the timestamps of a stream, their mean period in the context is used, because rates differ
+        between recordings.
         """
         period_ns = self._period_ns
         if self._stages.synchronize.rate_hz is None and len(self._times) > 1:
@@ -410,12 +413,12 @@ class LiveChain:
         return steps_ns
 
     def _push_plans(self, batch: pa.RecordBatch | pa.Table | BatchColumns) -> None:
-        """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""
+        """Add rows of plans; rows of the same arrival are one plan, also if they are in several batches."""
         if not self.reads_plan or not batch.num_rows:
             return
         names = batch.schema.names
         arrived = np.asarray(batch.column(names.index("t_ns")))
-        # times as bits of a float, so that a plan's rows are one array
+        # times as the bits of floats, so that a plan's rows are one array
         target = np.ascontiguousarray(batch.column(names.index("t_target_ns"))).view(np.float64)
         poses: Floats = np.column_stack([np.asarray(batch.column(names.index(name))) for name in POSE])
         rows = np.column_stack([target, poses])

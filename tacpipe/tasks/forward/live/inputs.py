@@ -1,4 +1,4 @@
-"""Find the columns that a forecaster reads among the streams of a rig, and make streams of planned motion."""
+"""Find the inputs of a forecaster in the streams of a rig, and create streams of planned motion."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Place = tuple[str, Indices]  # a stream, and columns of its samples
 
 
 def plan_schema() -> pa.Schema:
-    """Return the columns of the stream of plans: arrival, time at which the hand is to be at the pose, and the pose.
+    """Return the schema of the stream of plans: arrival, time at which the hand is to be at the pose, and the pose.
 
-    Rows that arrived at the same time are one plan.
+    Rows with the same arrival are one plan.
     """
     import pyarrow as pa
 
@@ -41,10 +41,10 @@ def plan_schema() -> pa.Schema:
 
 
 def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
-    """Return a plan as rows of `plan_schema`: ``poses`` (point, 3 or 7) at times ``t_ns`` (point,), which ascend.
+    """Return a plan as rows of `plan_schema`, from ``poses`` (point, 3 or 7) at ascending times ``t_ns`` (point,).
 
-    Without a quaternion the orientation is NaN: the hand keeps the one it has. Raises `TacpipeError` for other shapes, for
-    a position that is not finite and for times that do not ascend.
+    Without quaternions the orientation is NaN: the hand keeps its orientation. Raises `TacpipeError` for other shapes,
+    a position that is not finite, or times that are not ascending.
     """
     import pyarrow as pa
 
@@ -64,30 +64,30 @@ def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
 
 @dataclass(frozen=True)
 class InputLayout:
-    """The places of a forecaster's inputs in the samples of a rig's streams."""
+    """Where the inputs of a forecaster are in the samples of a rig's streams."""
 
     master: str
-    columns: Mapping[str, Sequence[str]]  # columns that are read, by stream
+    columns: Mapping[str, Sequence[str]]  # stream -> columns that are read
     readings: Mapping[str, StreamColumns]
-    tactile_of: Mapping[str, tuple[Indices, Indices]]  # columns and the channels that they hold, by stream
-    axes: Mapping[str, int]  # axes of the taxels, by stream
-    kinds: Mapping[str, np.dtype[Any]]  # types in which levels at rest are computed, by stream
+    tactile_of: Mapping[str, tuple[Indices, Indices]]  # stream -> its columns and their channels
+    axes: Mapping[str, int]  # stream -> axes of its taxels
+    kinds: Mapping[str, np.dtype[Any]]  # stream -> type in which rest levels are computed
     position: Place | None
     orientation: Place | None
     joints: tuple[Place, Place] | None  # angles and speeds
     finger: Place | None
-    position_m: Floats  # (3,), how many metres the unit of each coordinate is
+    position_m: Floats  # (3,), metres per unit of each coordinate
     finger_scale_m: float
-    # places of columns in batches, by stream
+    # stream -> indices of columns in batches
     _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)
 
     @classmethod
     def for_forecaster(
         cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = ""
     ) -> InputLayout:
-        """Return where inputs are in streams of these schemas, by the params of the model's `synchronize`.
+        """Find the inputs in streams with these schemas, by the params of the model's `synchronize`.
 
-        Raises `TacpipeError` if a stream or a channel is absent, or is another than the model's.
+        Raises `TacpipeError` if a stream or a channel is missing or differs from the model's.
         """
         import pyarrow as pa
 
@@ -158,9 +158,9 @@ class InputLayout:
         )
 
     def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> tuple[Times, Floats]:
-        """Return stamps (time,) and the columns that are read (time, column) of a batch of a stream.
+        """Return timestamps (time,) and the required columns (time, column) of a batch of a stream.
 
-        Raises `TacpipeError` if a column is absent.
+        Raises `TacpipeError` if a column is missing.
         """
         place = self._places.get(stream)
         if place is None or place[0] is not batch.schema:
@@ -180,14 +180,14 @@ class InputLayout:
         return t_ns, values
 
     def tactile(self, values: Mapping[str, Floats]) -> Floats:
-        """Return the tactile channels (channel,) of a row: ``values`` (column,) by stream."""
+        """Return the tactile channels (channel,) of a row, given as ``values`` (column,) by stream."""
         row = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
         for stream, (columns, channels) in self.tactile_of.items():
             row[channels] = values[stream][columns]
         return row
 
     def levels(self, rest_levels: Sequence[float]) -> dict[str, Floats]:
-        """Return levels of channels (channel,) as columns of the streams they are in, (column,), or NaN if there is none."""
+        """Return levels of channels (channel,) by stream as columns (column,), NaN for other columns."""
         by_stream = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
         for stream, (columns, channels) in self.tactile_of.items():
             by_stream[stream][columns] = np.asarray(rest_levels)[channels]
@@ -215,10 +215,10 @@ class InputLayout:
         return float(np.float32(values[stream][columns[0]] * self.finger_scale_m))
 
     def rest_levels(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
-        """Return each channel's level at rest (channel,) by the params of `segment contacts` from the rows of the rest."""
+        """Return each channel's rest level (channel,) from rows at rest, by the params of `segment contacts`."""
         stacked = np.stack(rows)  # (row, channel)
         levels = np.empty(stacked.shape[1])
-        t_ns = np.zeros(len(rows), np.int64)  # all of them count
+        t_ns = np.zeros(len(rows), np.int64)  # equal times, so that all rows are used
         for stream, (_, channels) in self.tactile_of.items():
             values = stacked[:, channels].astype(self.kinds[stream])
             levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
@@ -226,7 +226,7 @@ class InputLayout:
 
 
 def _stream_columns(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
-    """Return what is read of a stream; where its repeated samples matter, all its channels are added to ``names``."""
+    """Return the columns that are read of a stream. If its repeated samples matter, add all its channels to ``names``."""
     import pyarrow as pa
 
     compared: list[int] = []
@@ -247,7 +247,7 @@ def _stream_columns(schema: pa.Schema, names: list[str], synchronize: Any, *, is
 
 
 def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Schema) -> None:
-    """Refuse streams that are not those of the model's recordings."""
+    """Raise `TacpipeError` if the streams differ from those of the model's recordings."""
     codec, pose = forecaster.codec, forecaster.pose
     for name in (*codec.channels, *pose.columns):
         if name not in grid.names:
@@ -282,5 +282,5 @@ def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Sc
 
 
 def _array(column: Any) -> AnyArray:
-    """Return a column of a batch or of a table (time,)."""
+    """Return a column of a batch or a table as an array (time,)."""
     return np.asarray(column)

@@ -1,4 +1,4 @@
-"""Declare the messages of a session with a model of forward: a forecast with its alarms at each grid point."""
+"""Define the messages of a session with a forecasting model: a forecast with its alarms at each grid point."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class ForecastMessage(messages.Message):
     """A forecast with its alarms, or why there is none."""
 
     seq: int
-    t_ns: int  # time of the grid point, UTC as the recording has it
+    t_ns: int  # time of the grid point, UTC as in the recording
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
     cause: str = ""  # reason why there is no forecast, or the missing input
     flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
@@ -110,18 +110,20 @@ class ForecastMessage(messages.Message):
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
-    levels: tuple[int, ...] = ()  # levels of quantiles that the session publishes, percent
-    quantiles: Float32s | None = None  # (level, step, channel), of a forecast in a session that publishes some
+    levels: tuple[int, ...] = ()  # levels of the published quantiles in percent
+    quantiles: Float32s | None = (
+        None  # (level, step, channel), if the session publishes quantiles and there is a forecast
+    )
     declaration: ClassVar[Declaration] = DECLARATION
 
     @property
     def absent(self) -> frozenset[str]:
-        """The quantiles in a session that publishes none."""
+        """The fields that are absent: quantiles, if the session publishes none."""
         return ABSENT if self.levels else QUANTILES
 
     @property
     def answers(self) -> bool:
-        """True if there is a forecast."""
+        """Whether there is a forecast."""
         return self.values is not None
 
     @property
@@ -131,26 +133,26 @@ class ForecastMessage(messages.Message):
 
     @property
     def quantiles_by_level(self) -> dict[str, list[list[float]]] | None:
-        """The quantiles (step, channel) by level, None without a forecast."""
+        """The quantiles (step, channel) by level, or None without a forecast."""
         if self.quantiles is None:
             return None
         return {str(level): rows.tolist() for level, rows in zip(self.levels, self.quantiles, strict=True)}
 
     @property
     def quantile_columns(self) -> Float32s | None:
-        """The quantiles (level x step x channel,), None without a forecast."""
+        """The quantiles (level x step x channel,), or None without a forecast."""
         if self.quantiles is None:
             return None if self.levels else np.empty(0, np.float32)
         return self.quantiles.ravel()
 
     @property
     def alarms_by_name(self) -> dict[str, dict[str, str | float | None]]:
-        """State and score of each alarm as JSON has them."""
+        """State and score of each alarm as JSON."""
         return {name: {"state": alarm.word, "score": rounded(alarm.score)} for name, alarm in self.alarms.items()}
 
     @property
     def alarm_states(self) -> list[int]:
-        """The state of each alarm, a number."""
+        """The state of each alarm as a number."""
         return [self.alarms[name].state for name in NAMES]
 
     @property
@@ -161,7 +163,7 @@ class ForecastMessage(messages.Message):
 
 @dataclass(frozen=True)
 class ForecastDescription(messages.Description):
-    """Describes the values of forecasts."""
+    """Describe the values of forecasts."""
 
     channels: tuple[str, ...]
     steps: tuple[int, ...]
@@ -174,16 +176,16 @@ class ForecastDescription(messages.Description):
 
     @property
     def sizes(self) -> Sizes:
-        """Channels, steps, quantiles and alarms."""
+        """The numbers of channels, steps, quantiles and alarms."""
         return Sizes(self.channels, self.steps, self.quantiles, self.unit, NAMES)
 
     @property
     def absent(self) -> frozenset[str]:
-        """The quantiles in a session that publishes none."""
+        """The fields that are absent: quantiles, if the session publishes none."""
         return ABSENT if self.quantiles else QUANTILES
 
     def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+        """Return the description for JSON and msgpack."""
         return {
             "version": VERSION,
             "kind": "description",

@@ -1,8 +1,8 @@
 """Convert the blocks of a live session to predictions of a material model.
 
-A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones (`split_slides`).
-Several times a second the current slide is classified from all samples up to that time. The last prediction of a slide,
-from all of its samples, is final.
+A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones
+(`split_slides`). The current slide is classified several times per second from all samples so far. The last prediction
+of a slide, from all of its samples, is final.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 GAP_NS = 50_000_000  # age of the finger's newest sample above which its stream counts as silent
-MAX_DURATION_NS = 120_000_000_000  # maximum duration of a recording, whose rows are kept until it ends
+MAX_DURATION_NS = 120_000_000_000  # maximum duration of a recording, whose rows are in memory until it ends
 IDLE_NS = 20_000_000
 RESTARTED = "the model's process was started anew, and lacks what came before"
 THROWN = "blocks were thrown away under overload"

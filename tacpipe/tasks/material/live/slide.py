@@ -43,9 +43,9 @@ UNLIKE = "the slide is like none of the materials that the model knows"
 
 
 def slide_params(steps: Sequence[Step]) -> Any:
-    """Return the params of the stage `segment slides` that a material model was trained behind.
+    """Return the params of the stage `segment slides` of a material model.
 
-    Raises `UsageError` if that stage now has another version, `TacpipeError` if the model was trained behind other
+    Raises `UsageError` if that stage now has another version, `TacpipeError` if the model has other preprocessing
     stages.
     """
     names = [step["stage"] for step in steps]
@@ -106,7 +106,7 @@ class SlideSoFar:
     ) -> None:
         """Store the params of `segment slides` and the minimum fraction of a slide. Raises an error for an unknown sensor.
 
-        ``rate_hz`` is the rig's nominal rate. If None, the rate is that of the arrival times, which come in bursts on a
+        ``rate_hz`` is the rig's nominal rate. If None, the rate is that of the arrival times, which are bursty on a
         busy computer.
         """
         self._classifier, self._params, self._sensor = classifier, params, sensor

@@ -58,7 +58,7 @@ class MaterialLive(LiveTask):
         """Return the engine of a session.
 
         Raises `UsageError` if the rig's sensor is ambiguous. Raises `TacpipeError` if the rig lacks channels of the
-        model, or the model was trained behind a stage without a causal version.
+        model, or one of the model's stages has no causal version.
         """
         from tacpipe.tasks.material.classifier import Classifier
         from tacpipe.tasks.material.live.engine import MaterialEngine, find_finger
