@@ -308,7 +308,7 @@ class Dataset:
         """Return all recordings in one arrow table, with a first column ``recording`` unless the tables have one.
 
         ``stream`` is optional if each recording is a single table. ``labels`` appends attributes of the recordings as
-        columns: all of them, or those named.
+        columns: all of them, or those named. Raises `TacpipeError` if the dataset has no recordings.
         """
         from tacpipe.io.parquet import one_after_another
 

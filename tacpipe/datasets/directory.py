@@ -240,7 +240,7 @@ def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert file system errors about an output to a sentence."""
+    """Convert file system errors about an output to a sentence. Raises them as `TacpipeError`."""
     try:
         yield
     except OSError as error:

@@ -21,7 +21,10 @@ _NAMED = 5  # number of recordings named in an error
 
 
 def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
-    """Return the labels in ``name=value`` texts; numbers and true, false, null are parsed as in YAML."""
+    """Return the labels in ``name=value`` texts; numbers and true, false, null are parsed as in YAML.
+
+    Raises `UsageError` if a text is not a label, or there is nothing to change.
+    """
     labels: dict[str, Attribute] = {}
     for text in sets:
         name, equals, value = text.partition("=")

@@ -59,7 +59,10 @@ class LineageNode(TypedDict):
 
 
 def trace(path: Path) -> LineageNode:
-    """Return the lineage of the dataset (or report) at ``path`` as a tree, with the changes since the previous run."""
+    """Return the lineage of the dataset (or report) at ``path`` as a tree, with the changes since the previous run.
+
+    Raises `UsageError` if it is not in this store.
+    """
     store = locate(path if path.is_dir() else path.absolute().parent)
     root = store.roots.get((path.parent if path.name == manifest_of.NAME else path).absolute())
     if path.is_file() and path.name != manifest_of.NAME:

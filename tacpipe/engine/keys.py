@@ -167,7 +167,10 @@ def source_tasks(
 
 
 def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[WorkerTask]:
-    """Return one task per recording to simulate, named ``trial-000`` and so on."""
+    """Return one task per recording to simulate, named ``trial-000`` and so on.
+
+    Raises `UsageError` if there are too many.
+    """
     (argument,) = (name for name, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)
     if count > _MAX_TRIALS:

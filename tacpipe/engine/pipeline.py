@@ -49,7 +49,10 @@ def open_dataset(path: Path | str) -> Dataset:
 
 
 def run(request: Request) -> Outcome:
-    """Produce the dataset of ``request``, computing only what is not stored."""
+    """Produce the dataset of ``request``, computing only what is not stored.
+
+    Raises `UsageError` for options that exclude each other.
+    """
     started = time.perf_counter()
     if request.rerun and (request.check or request.compare):
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")

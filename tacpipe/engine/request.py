@@ -161,7 +161,7 @@ class RequestInputs:
 
     @cached_property
     def merged(self) -> Manifest:
-        """The input datasets merged into one."""
+        """The input datasets merged into one. Raises `UsageError` if there are none."""
         if not self.datasets:
             raise UsageError(f"{self.request.name} needs a dataset to read.")
         return selection.merge_manifests([dataset.manifest for dataset in self.datasets])
@@ -180,7 +180,7 @@ class RequestInputs:
 
     @cached_property
     def roles(self) -> dict[str, str]:
-        """Role by recording in the requested fold."""
+        """Role by recording in the requested fold. Raises `UsageError` if the stage needs a split and has none."""
         split = self.named_datasets.get("split")
         if split is None:
             raise UsageError(

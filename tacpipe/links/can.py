@@ -103,6 +103,8 @@ def _make_size_invalid(line: bytes) -> bytes:
 def parse_bus(target: str) -> tuple[str, str, int | None]:
     """Return kind, channel and bit rate of an address. The bit rate is None if the address has none.
 
+    Raises `UsageError` for an invalid address.
+
     >>> parse_bus("slcan:/dev/ttyACM0@1000000"), parse_bus("socketcan:can0")
     (('slcan', '/dev/ttyACM0', 1000000), ('socketcan', 'can0', None))
     """

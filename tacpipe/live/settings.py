@@ -130,7 +130,7 @@ class SessionOptions:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return the options in a line from `to_json`."""
+        """Return the options in a line from `to_json`. Raises `UsageError` if the task does not run live."""
         content = json.loads(text)
         live = registry.load_task(content["task"]).live
         if live is None:

@@ -118,7 +118,8 @@ def push(
 def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, replace: bool = False) -> Transferred:
     """Copy datasets from the store at ``remote``: those with a manifest at the path, or else those pushed from there.
 
-    ``PROJECT:PATH`` is a dataset that another project pushed; it is written to that path in this project.
+    ``PROJECT:PATH`` is a dataset that another project pushed; it is written to that path in this project. Raises
+    `UsageError` if the directory has another dataset, unless ``replace`` is set.
     """
     source, transferred = remote_store(remote), Transferred()
     for path in paths:

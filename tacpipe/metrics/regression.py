@@ -35,7 +35,8 @@ def rmse(true: AnyFloats, predicted: AnyFloats) -> float:
 def batch_mean_rmse(true: AnyFloats, predicted: AnyFloats, batch: int = BATCH) -> float:
     """Return the mean RMSE of successive batches of grasps, the last of which may be smaller; NaN if there are no grasps.
 
-    It is at most `rmse` if batches have equal sizes (Jensen), which is why both are reported.
+    It is at most `rmse` if batches have equal sizes (Jensen), which is why both are reported. Raises `TacpipeError` if
+    ``batch`` is below 1.
     """
     if batch < 1:
         raise TacpipeError(f"The batch size is {batch}; it must be 1 or more.")

@@ -96,7 +96,8 @@ class Readout:
         """Return the scores (slide, class) of slides (slide, feature).
 
         For ridge regression they are about 1 for a slide's class and -1 for others. For the nearest mean they are minus
-        half the squared distance from the slide to the class, up to a term that all classes share.
+        half the squared distance from the slide to the class, up to a term that all classes share. Raises
+        `TacpipeError` for another number of features.
         """
         if features.ndim != 2 or features.shape[1] != len(self.centre):
             raise TacpipeError(
@@ -210,7 +211,10 @@ class Level:
         return cls(classes.astype(np.int32), *parts)
 
     def scores(self, x: AnyFloats) -> AnyFloats:
-        """Return the scores (slide, class) of slides (slide, time, channel)."""
+        """Return the scores (slide, class) of slides (slide, time, channel).
+
+        Raises `TacpipeError` for another number of channels.
+        """
         if x.ndim != 3 or x.shape[2] != len(self.centre):
             raise TacpipeError(
                 f"Slides of {x.shape} do not fit the mean levels; (slide, time, {len(self.centre)}) was fitted."

@@ -44,7 +44,10 @@ def _members(union: Any) -> tuple[Kind, ...]:
 
 
 def tag(stage: AnyStage) -> str | None:
-    """Return the name of the field that selects among several kinds of params, or None if there is one kind."""
+    """Return the name of the field that selects among several kinds of params, or None if there is one kind.
+
+    Raises `TacpipeError` if that field does not distinguish them.
+    """
     alternatives = kinds(stage)
     if len(alternatives) == 1:
         return None

@@ -483,7 +483,7 @@ def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | Non
 
 
 def source(module: str) -> Path:
-    """Return the file of a module without importing it."""
+    """Return the file of a module without importing it. Raises `ImportError` if it does not exist."""
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise ImportError(module)

@@ -160,7 +160,7 @@ class Stage(Generic[P, R]):
 
     @functools.cached_property
     def arguments(self) -> dict[str, str]:
-        """The kind of each argument after ``params``, by name."""
+        """The kind of each argument after ``params``, by name. Raises `TacpipeError` for an unknown annotation."""
         kinds = {}
         for name, parameter in list(inspect.signature(self.function).parameters.items())[1:]:
             kind = _text(parameter.annotation).removesuffix(" | None").rpartition(".")[2]

@@ -325,7 +325,10 @@ class Spooled:
         spool_folders.remove(self.folder)
 
     def keep(self) -> Path:
-        """Move the sealed spool to the store's folder of retained spools, and return its new path."""
+        """Move the sealed spool to the store's folder of retained spools, and return its new path.
+
+        Raises `TacpipeError` if that folder is a symbolic link.
+        """
         target = self.folder.parent.parent / KEPT
         with readable_errors(target.parent):
             target.mkdir(mode=0o777, exist_ok=True)

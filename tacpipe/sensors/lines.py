@@ -198,7 +198,10 @@ class Lines(DescribedSensor):
         return read
 
     def decode(self, frames: Frames) -> Samples:
-        """Return the channels (line, channel) in one block per type, with sequence and clock. Comments have no sample."""
+        """Return the channels (line, channel) in one block per type, with sequence and clock. Comments have no sample.
+
+        Raises `ValueError` if a line is invalid.
+        """
         batch = self._parse(frames)
         if batch is None:
             raise ValueError("a line is not a frame")

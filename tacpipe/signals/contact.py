@@ -106,8 +106,8 @@ def tare_level(method: Literal["median", "first", "axis_mean"], values: AnyArray
 def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:
     """Return the level (channel,) to subtract from ``values`` (time, channel) for equal first values of all taxels.
 
-    The first value of each axis is then its mean over the taxels, truncated to an integer, as in the authors' notebooks.
-    Channels are ordered by taxel, with ``axes`` per taxel.
+    The first value of each axis is then its mean over the taxels, truncated to an integer, as in the authors'
+    notebooks. Channels are ordered by taxel, with ``axes`` per taxel. Raises `TacpipeError` if there are no rows.
 
     >>> axis_mean_level(np.array([[10, 1, 13, 2]]), axes=2).tolist()
     [-1.0, 0.0, 2.0, 1.0]
@@ -171,7 +171,10 @@ def noise_thresholds(
 
 
 def contact_mask(load: Floats, on: float | Floats, off: float | Floats) -> Bools:
-    """Return a mask of contact (time,), before `contact_intervals` merges, removes and extends contacts."""
+    """Return a mask of contact (time,), before `contact_intervals` merges, removes and extends contacts.
+
+    Raises `TacpipeError` for invalid thresholds.
+    """
     loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
     if not ((offs >= 0) & (offs <= ons)).all():
         raise TacpipeError(

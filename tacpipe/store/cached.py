@@ -337,7 +337,8 @@ class CachedStore(Store):
 
         ``needs`` maps the digest of a cached manifest to the sizes of its objects by name, and other digests to
         nothing. ``before`` is the last known manifest of that name: objects of the bucket's newest version have been
-        needed since it was named, so they exist and are not checked. ``lasting`` is as in `Store.roots`.
+        needed since it was named, so they exist and are not checked. ``lasting`` is as in `Store.roots`. Raises
+        `TacpipeError` if other commands write the same name again and again.
         """
         roots = self.bucket.roots
         root = roots.pushed(name, project["id"])

@@ -282,7 +282,8 @@ class RemoteStore:
     ) -> Record:
         """Record ``result`` for ``identity`` and return the valid record; the first of several processes wins.
 
-        An existing record stays valid unless it is damaged or ``replace`` is set.
+        An existing record stays valid unless it is damaged or ``replace`` is set. Raises `TacpipeError` if other
+        commands replace the record again and again.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)

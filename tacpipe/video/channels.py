@@ -102,7 +102,10 @@ class MarkerChannels:
         return [*displacements, quality]
 
     def values(self, image: Bytes) -> AnyFloats:
-        """Return the displacements in the next frame (marker and axis,), and the fraction of detected markers."""
+        """Return the displacements in the next frame (marker and axis,), and the fraction of detected markers.
+
+        Raises `TacpipeError` if the first frame has no grid of markers.
+        """
         from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
 
         if self._tracker is None:

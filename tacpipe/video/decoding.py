@@ -91,7 +91,7 @@ def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> I
 def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) -> dict[int, Bytes]:
     """Return the images of some rows of a stream of frames by row, as `decode_frames` yields them.
 
-    For each row, decoding starts at the preceding key frame.
+    For each row, decoding starts at the preceding key frame. Raises `TacpipeError` if the stream has no frames.
     """
     video_format = read_format(columns)
     if video_format is None:

@@ -162,7 +162,10 @@ def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) ->
 
 
 def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
-    """Yield the packets of a file in presentation order, given its `scan`; at most ``reorder_frames`` + 1 are buffered."""
+    """Yield the packets of a file in presentation order, given its `scan`; at most ``reorder_frames`` + 1 are buffered.
+
+    Raises `TacpipeError` if the file has changed since.
+    """
     rows = np.argsort(frames.packet_index).tolist()  # rows in the order of the file
     waiting: list[tuple[int, bytes]] = []
     following = 0

@@ -129,7 +129,10 @@ class Local:
 
 @contextlib.contextmanager
 def connected(address: str, jobs: int) -> Iterator[Local]:
-    """Yield the local executor with ``jobs`` processes, or one per usable core for 0. ``address`` must be empty."""
+    """Yield the local executor with ``jobs`` processes, or one per usable core for 0. ``address`` must be empty.
+
+    Raises `UsageError` otherwise.
+    """
     if address:
         raise UsageError(f"The executor local runs on this computer and has no address: leave {address} out.")
     yield Local(jobs)

@@ -144,7 +144,10 @@ class ZarrTree:
             ) from error
 
     def chunks(self, array: ArrayDescription, start: int, stop: int) -> list[str]:
-        """Return the names of the files in the store that contain rows of an array."""
+        """Return the names of the files in the store that contain rows of an array.
+
+        Raises `TacpipeError` if there are too many.
+        """
         node = self._node(array.path)
         assert node is not None
         shape, key = _chunk_grid(node[0])

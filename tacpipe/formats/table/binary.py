@@ -50,7 +50,7 @@ class ParquetFile:
     path: Path
 
     def names(self) -> list[str]:
-        """Return the names of the columns."""
+        """Return the names of the columns. Raises `TacpipeError` if the file is not Parquet."""
         try:
             with regular.opened(self.path) as file:
                 return list(pq.ParquetFile(file).schema_arrow.names)
@@ -58,7 +58,10 @@ class ParquetFile:
             raise TacpipeError(f"{self.path} is not a Parquet file: {plain(str(error), 200)}.") from error
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
-        """Yield the columns in ``types`` in blocks of rows, with the types of the file."""
+        """Yield the columns in ``types`` in blocks of rows, with the types of the file.
+
+        Raises `TacpipeError` if it is damaged.
+        """
         try:
             require_claims(self.path, list(types), rows=min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types))))
             with regular.opened(self.path) as file:

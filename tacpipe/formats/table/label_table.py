@@ -47,7 +47,10 @@ def plain_value(text: str) -> Attribute:
 
 
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each non-empty line, the header first; all lines must be as wide as the header."""
+    """Yield number and cells of each non-empty line, the header first; all lines must be as wide as the header.
+
+    Raises `TacpipeError` otherwise.
+    """
     text = read_text(path)
     separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)

@@ -228,7 +228,7 @@ class Layout:
 
 
 def parse_layout(text: str, place: str = "The layout") -> Layout:
-    """Return the layout in a TOML text; ``place`` names it in errors."""
+    """Return the layout in a TOML text; ``place`` names it in errors. Raises `UsageError` if it is invalid."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -240,7 +240,8 @@ def layout_from_tables(tables: Values, place: str = "The layout", container: For
     """Return the layout described by parsed TOML tables.
 
     With a ``container`` format, streams default to that format and need no files, time or columns, because the
-    container declares them. A layout without streams then covers everything in the container.
+    container declares them. A layout without streams then covers everything in the container. Raises `UsageError` if a
+    table or an entry is invalid.
     """
     _refuse_unknown(tables, place)
     for key in tables:

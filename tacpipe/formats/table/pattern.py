@@ -54,6 +54,8 @@ def compile_pattern(pattern: str) -> re.Pattern[str]:
 def match(pattern: str, text: str) -> dict[str, str] | None:
     """Return the text of each placeholder if the pattern matches all of ``text``, else None.
 
+    Raises `UsageError` if a text can match in too many ways.
+
     >>> match("{trial}/skin_{hand}.csv", "t-07/skin_left.csv")
     {'trial': 't-07', 'hand': 'left'}
     >>> match("**/{trial}.csv", "a/b/t1.csv"), match("*.csv", "a/t1.csv"), match("{a}-{a}", "x-y")

@@ -162,7 +162,8 @@ def _measured_fields(schema: pa.Schema) -> list[pa.Field]:
 def describe_sources(layout: Layout, folder: Path, sources: Sequence[RecordingFiles], kind: str | None = None) -> str:
     """Return a description of the recordings, labels, and the streams of the first readable recording, for a dry run.
 
-    ``kind`` is the container format whose declared streams are read if the layout has none.
+    ``kind`` is the container format whose declared streams are read if the layout has none. Raises `TacpipeError` if no
+    recording is readable.
     """
     labelled = labels.find_labels(layout, folder if folder.is_dir() else folder.parent, sources)
     count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"

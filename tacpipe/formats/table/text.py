@@ -167,7 +167,10 @@ class TextTable:
             )
 
     def place(self, index: int) -> str:
-        """Return the line of the data row ``index`` (from 0), for errors."""
+        """Return the line of the data row ``index`` (from 0), for errors.
+
+        Raises `IndexError` if there is no such row.
+        """
         for position, (line, _) in enumerate(self.rows()):
             if position == index + self.stream.header:
                 return f"line {line}"
@@ -216,7 +219,10 @@ class TextTable:
             header &= number < self.stream.skip_lines or not text or commented
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield number and cells of each non-empty line, including the header."""
+        """Yield number and cells of each non-empty line, including the header.
+
+        Raises `TacpipeError` if the file is not valid text.
+        """
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
         with open_text(self.path, self.stream.encoding) as file:
@@ -303,7 +309,10 @@ class Workbook:
     stream: StreamLayout
 
     def names(self) -> list[str]:
-        """Return the names of the columns: those of the header or the layout, or column1, column2, …."""
+        """Return the names of the columns: those of the header or the layout, or column1, column2, ….
+
+        Raises `TacpipeError` if a name is repeated or there is no row.
+        """
         with self._rows() as rows:
             first = next(rows, None)
             if first is None:

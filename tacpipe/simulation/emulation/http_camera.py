@@ -38,7 +38,10 @@ EPOCH_NS = 1_600_000_000_000_000_000  # time of the server's clock when the rig 
 
 
 def complete_camera(sensor: Camera, video: str) -> Camera:
-    """Return the sensor with the settings that the emulated camera reports, so that its frames can be encoded."""
+    """Return the sensor with the settings that the emulated camera reports, so that its frames can be encoded.
+
+    Raises `UsageError` if the rig file declares another image size.
+    """
     width_px, height_px, pixel_format = gel.WIDTH_PX, gel.HEIGHT_PX, "yuvj422p"
     if video:
         shape = read_shape(next(iter(_video_images(video))))

@@ -88,7 +88,7 @@ class Pty:
         self.replug()
 
     def replug(self) -> None:
-        """Create a new pseudo-terminal and point the link to it."""
+        """Create a new pseudo-terminal and point the link to it. Raises `UsageError` if the path is in use."""
         if self._master >= 0:
             return
         draft = self.link.with_name(f".{self.link.name}")

@@ -263,7 +263,10 @@ class Classifier:
         )
 
     def answers_from_scores(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
-        """Return the answers for slides (slide, time, channel) of a sensor, from their scores (slide, class)."""
+        """Return the answers for slides (slide, time, channel) of a sensor, from their scores (slide, class).
+
+        Raises `UsageError` if the model is not calibrated.
+        """
         if not self.calibrations:
             raise UsageError(
                 "The model has no calibrated probabilities and no answer unknown. Run `tacpipe calibrate MODEL DATASET "
@@ -290,7 +293,10 @@ class Classifier:
         return sensor or next(iter(self.layouts))
 
     def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
-        """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
+        """Return the score of each class (slide, class), in the order of ``classes``; see `predict`.
+
+        Raises `TacpipeError` for another shape, and if a value is not finite.
+        """
         layout = self.layout(self._resolve_sensor(sensor))
         frames = np.asarray(slides, np.float32)
         frames = frames[None] if frames.ndim == 2 else frames

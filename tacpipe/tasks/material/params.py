@@ -107,7 +107,10 @@ class MaterialModelParams(ABC):
         return 0
 
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return the fitted reader of each sensor. `Estimator` and `NetworkParams` implement it."""
+        """Return the fitted reader of each sensor. `Estimator` and `NetworkParams` implement it.
+
+        Raises `TacpipeError` if the architecture lacks it.
+        """
         raise TacpipeError(f"The architecture {self.architecture} has no method readers, so its models cannot be used.")
 
     def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:

@@ -260,6 +260,8 @@ def held_out_materials(
 ) -> dict[str, set[int]]:
     """Return the held-out materials of each sensor, from ``assignments`` like ``roboskin=17,18,19,20``.
 
+    Raises `UsageError` for an unknown sensor or class.
+
     >>> held_out_materials("b=3,4", [1, 2, 3, 4], ["a", "b"])
     {'a': set(), 'b': {3, 4}}
     """

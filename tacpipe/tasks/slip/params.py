@@ -120,7 +120,10 @@ class ForecastRule(SlipModelParams):
         object.__setattr__(self, "forward_digest", digest)
 
     def fit(self, training: SlipTraining) -> Scorer:
-        """Return the rule; only its calibration depends on the training windows."""
+        """Return the rule; only its calibration depends on the training windows.
+
+        Raises `UsageError` if ``forward_model`` is empty.
+        """
         if not self.forward_model:
             raise UsageError("forward_model names no model. Give the path of a model of the task forward.")
         return training.apply_rule(self)

@@ -67,7 +67,10 @@ class RuleScorer:
     runs_live: bool = False  # the forecasts come from another model
 
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
-        """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one."""
+        """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one.
+
+        Raises `TacpipeError` for a track without recording.
+        """
         import tacpipe
 
         if track.recording is None:

@@ -117,7 +117,7 @@ def _varies(values: Floats) -> bool:
 def load_scorer(
     architecture: str, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader
 ) -> Scorer:
-    """Return the scorer of a model's architecture."""
+    """Return the scorer of a model's architecture. Raises `ValueError` if it has none."""
     if "columns" in described:
         return BoostedScorer.load(arrays, described, reader)
     if "layers" in described:

@@ -219,7 +219,7 @@ class FingerReader:
         )
 
     def table(self, recording: Recording, finger: Finger) -> pa.Table:
-        """Return the columns of a finger in a recording."""
+        """Return the columns of a finger in a recording. Raises `TacpipeError` if a stream or column is missing."""
         names = ["t_ns", *finger.channels]
         stream = "" if set(recording.streams) == {""} else finger.stream
         if stream not in recording.streams:

@@ -157,7 +157,10 @@ class ForestMember:
     features: tuple[str, ...]
 
     def predict(self, grasps: Grasps) -> Floats:
-        """Return the values of all targets of this member as columns (grasp, value), device counts."""
+        """Return the values of all targets of this member as columns (grasp, value), device counts.
+
+        Raises `TacpipeError` if it was trained on other features.
+        """
         if self.coloured:
             require_colours(grasps.names, grasps.clouds)
         rows, names = geometry.feature_table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
@@ -177,7 +180,10 @@ class NetworkMember:
     params: PointNetwork
 
     def predict(self, grasps: Grasps) -> Floats:
-        """Return the values of its targets (grasp, value) in device counts, averaged over ``draws`` of the params."""
+        """Return the values of its targets (grasp, value) in device counts, averaged over ``draws`` of the params.
+
+        Raises `TacpipeError` if the network returns another shape.
+        """
         values = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
         if values.shape != (shape := (len(grasps), len(self.scale.offset))):
             raise TacpipeError(f"The network returns {values.shape}; it must return (cloud, value), here {shape}.")

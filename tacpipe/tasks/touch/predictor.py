@@ -212,7 +212,7 @@ class Predictor:
         """Return the model in the files that `tacpipe train touch` wrote.
 
         ``chain`` contains the model's preprocessing stages, as listed in its manifest. Without it `predict` cannot
-        check that recordings passed through the same stages.
+        check that recordings passed through the same stages. Raises `ValueError` if members do not predict all targets.
         """
         config: TouchConfig = model_files.tree(files, CONFIG, NEEDED)
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")

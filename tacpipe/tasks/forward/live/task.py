@@ -116,7 +116,10 @@ class ForwardLive(LiveTask):
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
-        """Return the engine with the model's causal chain, after a first forecast."""
+        """Return the engine with the model's causal chain, after a first forecast.
+
+        Raises `UsageError` for steps that the model does not predict.
+        """
         from tacpipe.tasks.forward.forecaster import Forecaster
         from tacpipe.tasks.forward.live import plans
         from tacpipe.tasks.forward.live.chain import LiveChain
