@@ -48,7 +48,7 @@ Kind = type | tuple[type, ...]
 
 @contextlib.contextmanager
 def validated(noun: str) -> Iterator[None]:
-    """Convert errors about files that were created or edited by hand to one sentence about ``noun``."""
+    """Raise errors about files that were created or edited by hand as one sentence about ``noun``."""
     try:
         yield
     except TacpipeError:

@@ -1,7 +1,7 @@
 """Write recordings as a Zarr replay buffer, as UMI and diffusion policy read it.
 
-Synchronized recordings, or any with ``--rate-hz``, one after another: ``data/STREAM_QUANTITY`` has the shape
-(frame, channel), ``meta/episode_ends`` the frame behind the last of each recording. Zarr's format 2.
+Recordings must be synchronized, or have ``--rate-hz``, and are concatenated: ``data/STREAM_QUANTITY`` has the shape
+(frame, channel), and ``meta/episode_ends`` the exclusive end of each recording. The format is Zarr 2.
 
 Example: tacpipe export zarr data/recordings -o exports/zarr --rate-hz 50 --actions robot
 """
@@ -58,7 +58,7 @@ class Params:
     rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
     master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # stream of the actions: its targets, else its state one frame later
-    common: bool = False  # leave out columns that not all recordings have
+    common: bool = False  # omit columns that not all recordings have
     # decode the frames of cameras into arrays STREAM_rgb (frame, row, column, rgb), the nearest in time to each row
     images: bool = added(False)
 

@@ -46,7 +46,7 @@ class WeighingReport(TaskReport):
         for result in results:
             config, errors = (json.loads(result.files[name]) for name in ("config.json", "errors.json"))
             sums = {
-                predictor: {thing: np.array([grams, 1.0]) for thing, grams in by_thing.items()}
+                predictor: {name: np.array([grams, 1.0]) for name, grams in by_thing.items()}
                 for predictor, by_thing in errors.items()
             }
             about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}

@@ -34,9 +34,9 @@ def make(params: Make, trial: Trial) -> RecordingOutput:
 
     t_ns = np.arange(params.rows) * 10_000_000  # (time,)
     values = (np.arange(params.rows) * (trial + 1) + params.offset).astype(np.uint16)  # (time,)
-    left = pa.table({"t_ns": t_ns, "x": pa.array(values, pa.uint16())})
+    left_table = pa.table({"t_ns": t_ns, "x": pa.array(values, pa.uint16())})
     right = pa.table({"t_ns": t_ns, "y": pa.array(values[::-1].copy(), pa.uint16())})
-    return RecordingOutput({"left": left, "right": right}, {"trial": trial, "material": "cork"})
+    return RecordingOutput({"left": left_table, "right": right}, {"trial": trial, "material": "cork"})
 
 
 @dataclass(frozen=True)

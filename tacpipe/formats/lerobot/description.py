@@ -219,7 +219,7 @@ def read_description(root: Path) -> LeRobotDescription:
 
 @contextlib.contextmanager
 def parquet_errors(path: Path) -> Iterator[None]:
-    """Convert errors of pyarrow and the system in the block to a `TacpipeError` with the file's name."""
+    """Raise errors of pyarrow and the system in the block as a `TacpipeError` with the file's name."""
     try:
         yield
     except FileNotFoundError as error:
