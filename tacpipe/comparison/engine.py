@@ -336,12 +336,12 @@ def observations(runs: Sequence[ComparedRun], question: Question, predictor: str
     import pandas as pd
 
     rows = []
-    for place, run in enumerate(runs):
+    for index, run in enumerate(runs):
         sums = run.questions[question].sums.get(predictor, {}) if question in run.questions else {}
         tested = "\n".join(sorted(sums))
-        rows += [(place, run.seed, run.fold, tested, name, *parts) for name, parts in sums.items()]
+        rows += [(index, run.seed, run.fold, tested, name, *parts) for name, parts in sums.items()]
     width = max(map(len, rows), default=0) - len(ABOUT)
-    return pd.DataFrame(rows, columns=[*ABOUT, *(f"s{place}" for place in range(width))])
+    return pd.DataFrame(rows, columns=[*ABOUT, *(f"s{index}" for index in range(width))])
 
 
 def paired_runs(

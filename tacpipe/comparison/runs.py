@@ -210,7 +210,7 @@ def separate(runs: Sequence[ComparedRun]) -> list[Method]:
             marks = [f"{name} {value}" for name, value in about.items()] if len(method.runs) > 1 else []
             name = " · ".join([method.name, *marks])
             methods.append(Method(name, method.family, run.settings, {**method.differing, **about}, (run,)))
-    order = {id(run): place for place, run in enumerate(runs)}
+    order = {id(run): index for index, run in enumerate(runs)}
     return sorted(methods, key=lambda candidate: order[id(candidate.runs[0])])
 
 

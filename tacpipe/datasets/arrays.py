@@ -238,7 +238,7 @@ def connect_duckdb(dataset: Dataset) -> duckdb.DuckDBPyConnection:
         having = dataset.only(recording.name for recording in dataset if stream in recording.streams)
         connection.register(stream or ONE_TABLE, having.table(stream))
     names = pa.table({"recording": pa.array(list(dataset.recordings), pa.string())})
-    rows = {recording.name: names.slice(place, 1) for place, recording in enumerate(dataset)}
+    rows = {recording.name: names.slice(index, 1) for index, recording in enumerate(dataset)}
     label_names = [name for name in _names(dataset) if name != "recording"]
     connection.register(
         LABELS_TABLE, pa.concat_tables(labelled_frame(dataset, rows, label_names).values()) if rows else names

@@ -263,7 +263,7 @@ def _leaves(params: StoredParams) -> StoredParams:
     """
     leaves: dict[str, ParamValue] = {}
     for name, value in params.items():
-        parts = _nested_params(value) or {str(place): row for place, row in enumerate(_rows(value))}
+        parts = _nested_params(value) or {str(index): row for index, row in enumerate(_rows(value))}
         leaves |= {f"{name}.{part}": leaf for part, leaf in _leaves(parts).items()} if parts else {name: value}
     return leaves
 

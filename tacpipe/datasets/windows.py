@@ -196,7 +196,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return _Selection(None if names == self.columns else at, scaling)
 
     def _positions(self, names: tuple[str, ...]) -> list[int]:
-        places = {name: place for place, name in enumerate(self.columns)}
+        places = {name: index for index, name in enumerate(self.columns)}
         return [places[name] for name in names]
 
     def _statistics(self) -> Scaling:

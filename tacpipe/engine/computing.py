@@ -81,11 +81,11 @@ def _overlap_tasks(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
     try:
         for task, store in tasks[:MAX_PENDING]:
             looks.append(pool.submit(store.seek, digest(task.identity)))
-        for place, (task, store) in enumerate(tasks):
+        for index, (task, store) in enumerate(tasks):
             with contextlib.suppress(TacpipeError):  # the next access reports the error
                 looks.popleft().result()
-            if place + MAX_PENDING < len(tasks):
-                later, its_store = tasks[place + MAX_PENDING]
+            if index + MAX_PENDING < len(tasks):
+                later, its_store = tasks[index + MAX_PENDING]
                 looks.append(pool.submit(its_store.seek, digest(later.identity)))
             unsent.append(_begin(task, store))
             sent.append(pool.submit(unsent[-1]))

@@ -306,17 +306,17 @@ def cloud_topic(stream: str, table: pa.Table, t_ns: int) -> Topic:
     coloured = len(cloud_columns(table.schema)) > len(POINT)
     names = ["x", "y", "z", *(["rgb"] if coloured else [])]
     points = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
-    for place, name in enumerate(POINT):
-        points[:, place] = column_numbers(table.column(name))
+    for index, name in enumerate(POINT):
+        points[:, index] = column_numbers(table.column(name))
     if coloured:
         red, green, blue = (column_numbers(table.column(name)).astype("<u4") for name in COLOURS)
         points[:, 3] = (red << 16 | green << 8 | blue).view("<f4")
     step = points.itemsize * len(names)
     fields: list[Part] = [count_part(len(names))]
-    for place, name in enumerate(names):
+    for index, name in enumerate(names):
         fields += [
             text_part(name),
-            count_part(place * points.itemsize),
+            count_part(index * points.itemsize),
             Constant(bytes([_FLOAT32])),
             count_part(1),
         ]

@@ -42,7 +42,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
             f"{source} is not a folder; give the folder that holds the slides, mat1_1_bio.csv and so on."
         )
     files_by_slide: dict[str, dict[str, Path]] = {}
-    for place, _, names in walk(source):
+    for folder, _, names in walk(source):
         for name in names:
             match = NAME.fullmatch(name)
             if match is None:
@@ -51,9 +51,9 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
             same = next((path for file_name, path in files.items() if file_name.endswith(f"_{match[3]}.csv")), None)
             if same is not None:  # the same slide in two folders, or as mat3_7_bio.csv and mat03_7_bio.csv
                 raise UsageError(
-                    f"{same} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
+                    f"{same} and {Path(folder) / name} are the same slide. Give the folder that holds one of them."
                 )
-            files[name] = Path(place) / name
+            files[name] = Path(folder) / name
     slides = {
         recording: dict(sorted(files.items()))
         for recording, files in sorted(files_by_slide.items())

@@ -222,12 +222,12 @@ def _has_mark(path: Path, content: bytes) -> bool:
 def find_containers(kind: str, source: Path) -> list[Path]:
     """Return the containers of this kind at or below ``source``, sorted. Containers inside a container are not listed."""
     paths = [source] if not source.is_dir() and is_container(kind, source) else []
-    for place, folders, names in file_system.walk(source) if source.is_dir() else ():
-        if is_container(kind, Path(place)):
-            paths.append(Path(place))
+    for folder, folders, names in file_system.walk(source) if source.is_dir() else ():
+        if is_container(kind, Path(folder)):
+            paths.append(Path(folder))
             folders.clear()
             continue
-        paths += [Path(place, name) for name in names if name.lower().endswith(KINDS[kind].endings)]
+        paths += [Path(folder, name) for name in names if name.lower().endswith(KINDS[kind].endings)]
     return sorted(paths)
 
 
@@ -256,8 +256,8 @@ def container_files(path: Path) -> dict[str, Path]:
     if not path.is_dir():
         return {"": path}
     return {
-        Path(place, name).relative_to(path).as_posix(): Path(place, name)
-        for place, _, names in file_system.walk(path)
+        Path(folder, name).relative_to(path).as_posix(): Path(folder, name)
+        for folder, _, names in file_system.walk(path)
         for name in sorted(names)
     }
 
@@ -358,10 +358,10 @@ def describe_unread(source: Path, read: Collection[Path], reason: Reason, output
 def _visible(source: Path, output: Path | None) -> Iterator[str]:
     """Yield the path of each visible file below a folder, except those in ``output``."""
     output_path = os.path.realpath(output) if output is not None else None
-    for place, folders, names in file_system.walk(source) if source.is_dir() else ():
+    for folder, folders, names in file_system.walk(source) if source.is_dir() else ():
         folders[:] = [
             name
             for name in folders
-            if not name.startswith(".") and (output_path is None or os.path.realpath(f"{place}/{name}") != output_path)
+            if not name.startswith(".") and (output_path is None or os.path.realpath(f"{folder}/{name}") != output_path)
         ]
-        yield from (os.fspath(Path(place, name)) for name in names if not name.startswith("."))
+        yield from (os.fspath(Path(folder, name)) for name in names if not name.startswith("."))

@@ -44,10 +44,10 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         )
     expected_names = set(names)
     holds: dict[Path, set[str]] = {}  # expected files in each trial
-    for place, _, files in walk(source):
+    for directory, _, files in walk(source):
         present_names = expected_names.intersection(files)
-        if present_names or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
-            holds[Path(place)] = present_names
+        if present_names or os.path.basename(directory).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
+            holds[Path(directory)] = present_names
     parents = {folder.parent for folder in holds}
     folders = sorted(folder for folder, present in holds.items() if present or folder not in parents)
     if not folders:
@@ -85,14 +85,16 @@ def by_object(
         )
     files_by_recording: dict[str, dict[str, Path]] = {}
     named_folders: list[tuple[str, Path]] = []
-    for place, _, files in walk(source):
+    for directory, _, files in walk(source):
         present_names = [name for name in names if name in files]
         if present_names:
-            above, folder = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
+            above, folder = os.path.split(os.path.abspath(directory))  # noqa: PTH100  (once a folder, on every hit)
             label, folder = text(os.path.basename(above)), text(folder)  # noqa: PTH119
             recording = valid(f"{label}-{folder.removeprefix(prefix)}")
-            named_folders.append((recording, Path(place)))
-            files_by_recording[recording] = {f"{label}/{folder}/{name}": Path(place, name) for name in present_names}
+            named_folders.append((recording, Path(directory)))
+            files_by_recording[recording] = {
+                f"{label}/{folder}/{name}": Path(directory, name) for name in present_names
+            }
     paths.refuse_shared_names(named_folders)
     if not files_by_recording:
         raise TacpipeError(

@@ -126,11 +126,11 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
 def _find_blocks(source: Path) -> list[tuple[str, Path]]:
     """Return the blocks below a folder as pairs of name and path."""
     blocks = []
-    for place, below, names in walk(source):
+    for folder, below, names in walk(source):
         for name in sorted(names):
             match = BLOCK.fullmatch(name)
             if match is not None:
-                blocks.append((match[2] or f"fold{int(match[1])}", Path(place) / name))
+                blocks.append((match[2] or f"fold{int(match[1])}", Path(folder) / name))
                 below.clear()  # subfolders of the published folder contain arrays derived from these
     return blocks
 
@@ -297,9 +297,9 @@ def is_time(values: AnyArray, axis: int, lowest: float = MIN_AUTOCORRELATION) ->
     import numpy as np
 
     candidate = axis % values.ndim
-    along = [lag_one(values, place) for place in range(values.ndim)]
+    along = [lag_one(values, index) for index in range(values.ndim)]
     other_axes = [
-        correlation for place, correlation in enumerate(along) if place != candidate and np.isfinite(correlation)
+        correlation for index, correlation in enumerate(along) if index != candidate and np.isfinite(correlation)
     ]
     return along[candidate] >= lowest and all(along[candidate] > correlation for correlation in other_axes)
 

@@ -196,11 +196,11 @@ def _read_counts(path: Path) -> list[int]:
             f"the first empty, then {VALUES // 2} counts of the middle finger and {VALUES // 2} of the thumb. Copy it again."
         )
     values = []
-    for place, cell in enumerate(cells, start=2):
+    for index, cell in enumerate(cells, start=2):
         count = cell.strip()
         if not (count.isascii() and count.isdigit() and len(count) <= 4 and int(count) <= MAX_COUNT):
             raise TacpipeError(
-                f"{path}, row 1, field {place}: {count[:20]!r} is not a count; it must be a whole number from 0 to "
+                f"{path}, row 1, field {index}: {count[:20]!r} is not a count; it must be a whole number from 0 to "
                 f"{MAX_COUNT} (12 bits). Copy it again."
             )
         values.append(int(count))

@@ -163,7 +163,7 @@ def _require_size(path: Path, size: int, max_bytes: int | None) -> None:
 
 def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: int) -> Iterator[int]:
     """Yield the size in bytes of the texts in this number of rows; each dictionary entry is read once."""
-    leaves = [schema.column(place) for place in range(len(schema))]
+    leaves = [schema.column(index) for index in range(len(schema))]
     for path in (leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"):
         if columns is None or path in columns or path.partition(".")[0] in columns:
             file.seek(0)

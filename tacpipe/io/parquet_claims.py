@@ -72,7 +72,7 @@ class Claims:
     def __init__(self, schema: ParquetSchema, content: Bytes) -> None:
         length = int.from_bytes(content[-8:-4], "little")
         footer, _ = _struct(content, len(content) - 8 - length, len(content) - 8, 0)
-        leaves = (schema.column(place) for place in range(len(schema)))
+        leaves = (schema.column(index) for index in range(len(schema)))
         self._leaves = [_Leaf(leaf.path, leaf.physical_type, leaf.length) for leaf in leaves]
         self._groups: list[list[Any]] = [group.get(1) or [] for group in footer.get(4) or ()]
         self._counted: dict[tuple[int, bool], tuple[int, int]] = {}  # bytes and largest page by column and `shared`

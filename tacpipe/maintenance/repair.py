@@ -180,16 +180,16 @@ def repair(store: Store) -> Soundness:
 def _rewrite_roots(store: Store) -> list[str]:
     """Rewrite damaged roots whose datasets are next to the store; return their names."""
     names, rewritten = store.roots.damaged(), []
-    for place, folders, files in walk(store.root.parent, links=False) if names else ():
+    for directory, folders, files in walk(store.root.parent, links=False) if names else ():
         folders[:] = [folder for folder in folders if not folder.startswith(".")]
         if manifest_of.NAME not in files:
             continue
-        dataset = _sound(Path(place))
+        dataset = _sound(Path(directory))
         if dataset is None:
             continue
         for name in names:
-            if store.roots.is_of(name, Path(place)):
-                store.roots.set(Path(place), dataset.digest)
+            if store.roots.is_of(name, Path(directory)):
+                store.roots.set(Path(directory), dataset.digest)
                 rewritten.append(f"root {name}")
     return rewritten
 
@@ -270,10 +270,10 @@ def _measure_folder(store: Store, name: _Measured) -> FolderSize:
     sizes = []
 
     with readable_errors(store.root):
-        for place, _, files in walk(store.root / name, links=False):
+        for folder, _, files in walk(store.root / name, links=False):
             for file in files:
                 with contextlib.suppress(FileNotFoundError):
-                    sizes.append(os.lstat(f"{place}/{file}").st_size)
+                    sizes.append(os.lstat(f"{folder}/{file}").st_size)
     return {"files": len(sizes), "bytes": sum(sizes)}
 
 

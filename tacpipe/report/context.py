@@ -261,8 +261,8 @@ class Context:
         """Return the method with the best mean rank over the targets of a part; ties are broken by name."""
         ranks: dict[str, list[int]] = {}
         for method in self.parts[part]:
-            for place, row in enumerate(method.models):
-                ranks.setdefault(row.name, []).append(place)
+            for index, row in enumerate(method.models):
+                ranks.setdefault(row.name, []).append(index)
         target_count = max(map(len, ranks.values()), default=0)
         mean_ranks = {name: float(np.mean(places)) for name, places in ranks.items() if len(places) == target_count}
         best = min(mean_ranks, key=lambda name: (mean_ranks[name], name), default=None)

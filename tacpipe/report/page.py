@@ -99,7 +99,7 @@ def _pack_column(values: list[Any]) -> Any:
         isinstance(value_key, bool) for value_key in values
     ):
         return values
-    places = {value_key: place for place, value_key in enumerate(distinct)}
+    places = {value_key: index for index, value_key in enumerate(distinct)}
     return {
         "of": [value_key for _, value_key in distinct],
         "at": [places[type(value_key), value_key] for value_key in values],

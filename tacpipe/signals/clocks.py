@@ -242,7 +242,7 @@ def _envelope_slope(since_ns: Floats, level_ns: Floats) -> float:
     if len(hull) < 2:
         return 0.0
     mean = float(since_ns.mean())
-    right = next((place for place, (time, _) in enumerate(hull) if time >= mean and place), len(hull) - 1)
+    right = next((index for index, (time, _) in enumerate(hull) if time >= mean and index), len(hull) - 1)
     (time, level), (next_time, next_level) = hull[right - 1], hull[right]
     return (next_level - level) / (next_time - time)
 

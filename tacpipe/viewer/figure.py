@@ -160,9 +160,9 @@ def _draw_panel(axes: Any, panel: Panel, start_ns: int) -> None:
     t_ns, values = envelope(panel.t_ns, panel.values, MAX_POINTS)
     seconds = _s(t_ns, start_ns)
     vector = set(panel.names) <= set("xyzw")
-    for place, name in enumerate(panel.names):
-        colour = drawing.indexed_colour(place, drawing.AXES if vector else drawing.PRINTED)
-        axes.plot(seconds, values[:, place], color=colour, linewidth=LINE, label=name if place < MAX_LEGEND else None)
+    for index, name in enumerate(panel.names):
+        colour = drawing.indexed_colour(index, drawing.AXES if vector else drawing.PRINTED)
+        axes.plot(seconds, values[:, index], color=colour, linewidth=LINE, label=name if index < MAX_LEGEND else None)
     axes.set_title(panel.title, loc="left")
     axes.grid(alpha=0.25)
     axes.margins(x=0)
@@ -183,17 +183,17 @@ def _draw_panel(axes: Any, panel: Panel, start_ns: int) -> None:
 def _draw_lanes(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
     """Draw the spans of each lane as bars, with their texts if they fit."""
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
-    for place, (lane, spans) in enumerate(lanes.items()):
-        colour = drawing.FAULT if lane == "gaps" else drawing.indexed_colour(place)
+    for index, (lane, spans) in enumerate(lanes.items()):
+        colour = drawing.FAULT if lane == "gaps" else drawing.indexed_colour(index)
         # bars by style; bars of the same style are drawn at once
         bars: dict[tuple[tuple[str, str], ...], list[tuple[float, float]]] = {}
         for span in spans:
             left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
             bars.setdefault(tuple(_style(span, colour).items()), []).append((left, width))
             if width > 0.012 * width_s * len(span.text):
-                axes.text(left + width / 2, place, span.text, ha="center", va="center", fontsize=7)
+                axes.text(left + width / 2, index, span.text, ha="center", va="center", fontsize=7)
         for style, extents in bars.items():
-            axes.broken_barh(extents, (place - 0.35, 0.7), linewidth=0.5, **{"edgecolor": "white", **dict(style)})
+            axes.broken_barh(extents, (index - 0.35, 0.7), linewidth=0.5, **{"edgecolor": "white", **dict(style)})
     axes.set_yticks(range(len(lanes)), [plain(lane) for lane in lanes])
     axes.invert_yaxis()
     padded = any(span.text == PADDING for spans in lanes.values() for span in spans)
@@ -234,8 +234,8 @@ def _draw_single_reading(contents: DrawnContents) -> Any:
     figure = Figure(figsize=(3.4 * columns, 3.6 * rows + 0.4), dpi=DPI, layout="constrained")
     figure.suptitle(_title(contents), x=0.01, ha="left", fontsize=11)
     low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
-    for place, finger in enumerate(fingers):
-        axes: Any = figure.add_subplot(rows, columns, place + 1)
+    for index, finger in enumerate(fingers):
+        axes: Any = figure.add_subplot(rows, columns, index + 1)
         colours = drawing.map_colours(finger.magnitude[-1], low, high) / 255
         axes.scatter(*finger.places.T, c=colours, s=260, edgecolors="#6e7781", linewidths=0.5)
         for (x, y), value in zip(finger.places, finger.magnitude[-1], strict=True):

@@ -48,8 +48,8 @@ class RerunStream:
 
     def send(self, contents: DrawnContents) -> None:
         """Write all contents of a recording."""
-        for place, finger in enumerate(contents.taxels):
-            self._touch(finger, place)
+        for index, finger in enumerate(contents.taxels):
+            self._touch(finger, index)
             self._channels(finger)
         for name, members in group_by_scale(contents.taxels).items():
             self._maps(name, members)
@@ -99,7 +99,7 @@ class RerunStream:
     def _curves(self, parts: Sequence[str], curves: Curves) -> None:
         are_axes = curves.names in (tuple("xyz"), tuple("xyzw"), tuple("xy"))
         colours = drawing.AXES if are_axes else drawing.DISTINCT
-        names_and_colours = [(name, drawing.indexed_colour(place, colours)) for place, name in enumerate(curves.names)]
+        names_and_colours = [(name, drawing.indexed_colour(index, colours)) for index, name in enumerate(curves.names)]
         self._lines(parts, curves.t_ns, curves.values, names_and_colours)
 
     def _touch(self, finger: Taxels, place: int) -> None:
@@ -112,7 +112,7 @@ class RerunStream:
         """Write the change of each taxel, one plot per axis."""
         if len(finger.t_ns) < 2:
             return
-        names_and_colours = [(name, drawing.indexed_colour(place)) for place, name in enumerate(finger.names)]
+        names_and_colours = [(name, drawing.indexed_colour(index)) for index, name in enumerate(finger.names)]
         for axis, name in enumerate(AXES if finger.change.shape[2] == 3 else ("",)):
             parts = (CHANNELS, finger.name, channels_title(finger, name))
             self._lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
@@ -189,8 +189,8 @@ class RerunStream:
         """Write the measured load of a finger, the predicted load at each step, and the errors."""
         measured_line, last = [("measured", drawing.MEASURED)], steps[-1].measured
         self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
-        for place, forecast in enumerate(steps):
-            names_and_colours = [(f"t+{forecast.step}", drawing.indexed_colour(place))]
+        for index, forecast in enumerate(steps):
+            names_and_colours = [(f"t+{forecast.step}", drawing.indexed_colour(index))]
             parts = (name, names_and_colours[0][0])
             self._lines(
                 (FORECAST, *parts), forecast.predicted.t_ns, forecast.predicted.load[:, None], names_and_colours
@@ -234,9 +234,9 @@ class RerunStream:
         lanes: dict[str, list[Span]] = {}
         for span in (*contents.spans, *merge_lanes(contents.gaps), *event_spans):
             lanes.setdefault(span.lane, []).append(span)
-        for place, (lane, spans) in enumerate(lanes.items()):
+        for index, (lane, spans) in enumerate(lanes.items()):
             is_fault = lane == "gaps" or lane.startswith("events")
-            self._lane(lane, spans, drawing.FAULT if is_fault else drawing.indexed_colour(place))
+            self._lane(lane, spans, drawing.FAULT if is_fault else drawing.indexed_colour(index))
         if contents.events:
             rr = _rerun()
             at_ns = np.array([event.t_ns for event in contents.events])
@@ -420,7 +420,7 @@ def _shades(colour: str, count: int) -> list[tuple[int, int, int]]:
     """Return a colour for each of ``count`` values of a lane, alternately lighter and darker."""
     bright = drawing.rgb(colour)
     dark = (int(bright[0] * 0.7), int(bright[1] * 0.7), int(bright[2] * 0.7))
-    return [dark if place % 2 else bright for place in range(count)]
+    return [dark if index % 2 else bright for index in range(count)]
 
 
 def _labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:

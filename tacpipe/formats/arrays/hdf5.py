@@ -263,8 +263,8 @@ def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescrip
 def _filters(dataset: h5py.Dataset) -> Iterator[int]:
     """Yield the numbers of the filters that the chunks of an array passed through."""
     about = dataset.id.get_create_plist()
-    for place in range(about.get_nfilters()):
-        yield about.get_filter(place)[0]
+    for index in range(about.get_nfilters()):
+        yield about.get_filter(index)[0]
 
 
 def _read_attributes(owner: Any, file: Path) -> StoredAttributes:

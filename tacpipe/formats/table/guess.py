@@ -55,7 +55,7 @@ class _FileGroup:
 def guess_layout(folder: Path) -> str:
     """Return the text of a layout for the files below ``folder``. Raises `UsageError` if none of them can be a stream."""
     all_paths = [
-        Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names
+        Path(directory, name).relative_to(folder) for directory, _, names in file_system.walk(folder) for name in names
     ]
     data = [path for path in all_paths if extension(path) in EXTENSIONS]
     videos = [path for path in all_paths if extension(path) in DEMUXERS]

@@ -185,11 +185,11 @@ def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, .
                 before = _count_before_slots(kinds[0], before - 1)
             else:
                 after = _count_before_slots(kinds[0][::-1], after - 1)
-    parts = [(kinds[0][place], tuple(tokens[place][1] for tokens in names)) for place in range(before)]
+    parts = [(kinds[0][index], tuple(tokens[index][1] for tokens in names)) for index in range(before)]
     if any(len(tokens) > before + after for tokens in names):
         middles = tuple("".join(text for _, text in tokens[before : len(tokens) - after]) for tokens in names)
         parts.append(("text", middles))
-    parts += [(kinds[0][-place], tuple(tokens[-place][1] for tokens in names)) for place in range(after, 0, -1)]
+    parts += [(kinds[0][-index], tuple(tokens[-index][1] for tokens in names)) for index in range(after, 0, -1)]
     return parts
 
 

@@ -403,7 +403,10 @@ def image_paths(folder: Path) -> list[Path]:
     Raises `TacpipeError` if there is none.
     """
     paths = [
-        Path(place, name) for place, _, names in file_system.walk(folder) if Path(place) == folder for name in names
+        Path(directory, name)
+        for directory, _, names in file_system.walk(folder)
+        if Path(directory) == folder
+        for name in names
     ]
     images = [path for path in paths if path.suffix.lower() in video_files.IMAGE_CODECS]
     if not images:

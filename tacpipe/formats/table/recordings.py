@@ -145,12 +145,12 @@ def _candidate_paths(layout: Layout, folder: Path) -> list[Path]:
     """Return the paths to match with patterns: all files below a folder, and folders that are containers of the layout."""
     containers = {str(stream.format) for stream in layout.streams if stream.contained}
     paths: list[Path] = []
-    for place, folders, names in file_system.walk(folder):
-        if any(is_container(kind, Path(place)) for kind in containers):
-            paths.append(Path(place))
+    for directory, folders, names in file_system.walk(folder):
+        if any(is_container(kind, Path(directory)) for kind in containers):
+            paths.append(Path(directory))
             folders.clear()
             continue
-        paths += [Path(place, name) for name in names]
+        paths += [Path(directory, name) for name in names]
     return [path.relative_to(folder) for path in paths]
 
 

@@ -89,7 +89,7 @@ def short(value: float) -> float | None:
 def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
     """Return bars in the given order, the first ``marked`` in another colour."""
     rows: list[DataRow] = [
-        {"x": name, "y": short(value), "kept": place < marked} for place, (name, value) in enumerate(values.items())
+        {"x": name, "y": short(value), "kept": index < marked} for index, (name, value) in enumerate(values.items())
     ]
     colour: ChartChannel = {
         "field": "kept",
@@ -306,7 +306,7 @@ def _rows(curve: Curve, number: int) -> list[DataRow]:
     if bounds[0] is None:
         x, y = decimated(x, y)
     rows: list[DataRow] = []
-    for place, (at, value) in enumerate(zip(x, y, strict=True)):
+    for index, (at, value) in enumerate(zip(x, y, strict=True)):
         row: DataRow = {
             "name": curve.name,
             "run": number,
@@ -315,7 +315,7 @@ def _rows(curve: Curve, number: int) -> list[DataRow]:
             "dashed": curve.dashed,
             "thin": curve.thin,
         }
-        if bounds[0] is not None and bounds[1] is not None and not np.isnan([bounds[0][place], bounds[1][place]]).any():
-            row |= {"low": short(bounds[0][place]), "high": short(bounds[1][place])}
+        if bounds[0] is not None and bounds[1] is not None and not np.isnan([bounds[0][index], bounds[1][index]]).any():
+            row |= {"low": short(bounds[0][index]), "high": short(bounds[1][index])}
         rows.append(row)
     return rows

@@ -202,12 +202,12 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
     lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
     row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
     values: list[DataRow] = []
-    for place, estimate in enumerate(dots):
+    for index, estimate in enumerate(dots):
         off = estimate.mean < low or estimate.mean > high
         values.append(
             {
                 "name": "\n".join(lines_by_name[estimate.name]), "panel": estimate.panel,
-                "place": place, "kind": estimate.kind,
+                "place": index, "kind": estimate.kind,
                 "x": short(min(max(estimate.mean, low), high)), "mean": short(estimate.mean),
                 "low": short(min(max(estimate.low, low), high)), "high": short(min(max(estimate.high, low), high)),
                 "off": ("left" if estimate.mean < low else "right") if off else "",

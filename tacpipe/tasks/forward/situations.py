@@ -141,9 +141,9 @@ class BySituation:
             step: {
                 part: _round(value)
                 for part in ("mean", "low", "high")
-                if math.isfinite(value := getattr(interval, part)[place])
+                if math.isfinite(value := getattr(interval, part)[index])
             }
-            for place, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"])
+            for index, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"])
         }
         return {
             "windows": count,

@@ -47,7 +47,7 @@ class FingerLayout:
     def from_layout(cls, layout: Layout) -> FingerLayout:
         """Return the places of a finger's channels; an axis is used where all its taxels have it."""
         axes = {
-            axis: [place for place, channel in enumerate(layout) if channel.get("axis") == axis]
+            axis: [index for index, channel in enumerate(layout) if channel.get("axis") == axis]
             for axis in ("x", "y", "z")
         }
         has_shear = bool(axes["x"]) and len(axes["x"]) == len(axes["y"])
@@ -129,12 +129,12 @@ def _spectra(levels: Floats) -> Floats:
     rows = levels.shape[1]
     around = levels - levels.mean(axis=1, keepdims=True)
     amplitudes = np.full((len(levels), len(CYCLES)), np.nan)
-    for place, cycles in enumerate(CYCLES):
+    for index, cycles in enumerate(CYCLES):
         if 2 * cycles < rows:
             angle = 2 * np.pi * cycles * np.arange(rows) / rows
             # sums of products instead of a transform, whose bits may depend on the number of windows
             parts = [(around * wave).sum(axis=1) for wave in (np.cos(angle), np.sin(angle))]
-            amplitudes[:, place] = np.hypot(*parts) / rows
+            amplitudes[:, index] = np.hypot(*parts) / rows
     return amplitudes
 
 

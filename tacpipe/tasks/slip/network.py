@@ -80,7 +80,7 @@ class WindowWork:
             rows = windows.rows[chosen[places]]
             track = windows.tracks[number]
             parts[places] = stack_fingers(
-                [track.windows(rows, place, finger.rows) for place, finger in enumerate(windows.reader.fingers)]
+                [track.windows(rows, index, finger.rows) for index, finger in enumerate(windows.reader.fingers)]
             )
         return torch.from_numpy(parts)
 
@@ -149,11 +149,11 @@ class ConvolutionScorer:
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
         """Return the scores of rows of a track (row,), one window at a time."""
         scores = np.empty(len(rows))
-        for place, row in enumerate(rows):
+        for index, row in enumerate(rows):
             windows = [
                 track.windows(np.array([row]), number, finger.rows)[0] for number, finger in enumerate(reader.fingers)
             ]
-            scores[place] = self.score_window(reader, windows)
+            scores[index] = self.score_window(reader, windows)
         return scores
 
     def score_features(self, features: Floats) -> None:

@@ -136,7 +136,7 @@ def baseline_columns(fingers: int) -> dict[str, tuple[int, ...]]:
     names = feature_names(fingers)
 
     def places(*words: str) -> tuple[int, ...]:
-        return tuple(place for place, name in enumerate(names) if name.removeprefix("largest ") in words)
+        return tuple(index for index, name in enumerate(names) if name.removeprefix("largest ") in words)
 
     return {
         "time_only": (len(names),),

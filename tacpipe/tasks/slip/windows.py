@@ -242,8 +242,8 @@ class FingerReader:
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
             by_finger = [
-                finger_features(track.windows(rows[block], place, finger.rows), finger.places)
-                for place, finger in enumerate(self.fingers)
+                finger_features(track.windows(rows[block], index, finger.rows), finger.places)
+                for index, finger in enumerate(self.fingers)
             ]
             features[block, :columns] = combine_fingers(by_finger)
         features[:, columns] = track.since_s[rows]

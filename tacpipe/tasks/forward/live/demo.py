@@ -66,12 +66,12 @@ def draw(
         for begins_ns in slips_ns[:, 0].tolist():
             axes.axvline((begins_ns - start_ns) / 1e9, color=SLIPPED, linewidth=0.6, alpha=0.6)
     nears: list[Any] = []
-    for place, begins_ns in enumerate(slips_ns[:MAX_DRAWN_SLIPS, 0].tolist()):
-        near = figure.add_subplot(grid[2, place], sharey=nears[0] if nears else None)
+    for index, begins_ns in enumerate(slips_ns[:MAX_DRAWN_SLIPS, 0].tolist()):
+        near = figure.add_subplot(grid[2, index], sharey=nears[0] if nears else None)
         nears.append(near)
         _draw_slip_alarm(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)
         near.set_title(f"slip at {(begins_ns - start_ns) / 1e9:.1f} s\n{lead_in_words(alarm, begins_ns, horizon_ns)}")
-        if place == 0:
+        if index == 0:
             near.set_ylabel("slip alarm's score,\nmultiples of its level")
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
@@ -100,9 +100,9 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
     steps = sorted({int(name.rpartition("_t")[2]) for name in table.column_names if "_taxel" in name})
     t_ns = table.column("t_device_ns").to_numpy()
     levels: Floats = np.empty((len(t_ns), len(steps), len(names)))
-    for place, step in enumerate(steps):
+    for index, step in enumerate(steps):
         for channel, name in enumerate(names):
-            levels[:, place, channel] = table.column(f"{name}_t{step}").to_numpy()
+            levels[:, index, channel] = table.column(f"{name}_t{step}").to_numpy()
     pulled = shear(levels, layout)[..., 0]  # (row, step)
     at_s = (t_ns - start_ns) / 1e9
     period_s = horizon_ns / 1e9 / steps[-1]
@@ -121,11 +121,11 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
 
 def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> None:
     """Draw when alarms are on and when the object slips."""
-    for place, name in enumerate(("load", "slip")):
+    for index, name in enumerate(("load", "slip")):
         state = alarm[f"{name}_state"].to_numpy()
         for value, colour in ((0, QUIET), (1, PREDICTED)):
             rows = alarm_s[state == value]
-            axes.plot(rows, np.full(len(rows), place), "|", color=colour, markersize=12)
+            axes.plot(rows, np.full(len(rows), index), "|", color=colour, markersize=12)
     axes.plot(slips_s, np.full(len(slips_s), 2), "|", color=SLIPPED, markersize=12)
     axes.set_yticks([0, 1, 2], ["load alarm (on: orange)", "slip alarm (on: orange)", "slip (truth)"])
     axes.set_ylim(-0.6, 2.6)

@@ -251,9 +251,9 @@ def _offline_states(
     alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
     layout = forecaster.codec.layout
     states = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
-    for place, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
+    for index, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
         for name, state in alarms.states(ahead, track.tactile[row], layout).items():
-            states[name][place] = state.state
+            states[name][index] = state.state
     return states
 
 
@@ -297,9 +297,9 @@ class Published:
 
         def stacked(endings: Sequence[str]) -> Float32s:
             values_at = np.empty((forecast.num_rows, len(endings), len(channels)), np.float32)
-            for place, ending in enumerate(endings):
+            for index, ending in enumerate(endings):
                 for channel, name in enumerate(channels):
-                    values_at[:, place, channel] = forecast.column(f"{name}_{ending}").to_numpy()
+                    values_at[:, index, channel] = forecast.column(f"{name}_{ending}").to_numpy()
             return values_at
 
         values = stacked([f"t{step}" for step in steps])

@@ -276,12 +276,12 @@ def sums_by_recording(
     at, width = [errors.steps.index(step) for step in steps], errors.channels[group]
     return {
         name: headline.sums(
-            (predictor_sums[0][place, at], predictor_sums[1][place, at]),
-            (persistence_sums[0][place, at], persistence_sums[1][place, at]),
-            float(errors.windows[place]) * width,
+            (predictor_sums[0][index, at], predictor_sums[1][index, at]),
+            (persistence_sums[0][index, at], persistence_sums[1][index, at]),
+            float(errors.windows[index]) * width,
         )
-        for place, name in enumerate(errors.recordings)
-        if errors.windows[place] and (known_objects is None or bool(errors.known[place]) == known_objects)
+        for index, name in enumerate(errors.recordings)
+        if errors.windows[index] and (known_objects is None or bool(errors.known[index]) == known_objects)
     }  # fmt: skip
 
 

@@ -215,7 +215,7 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
         kept_latents, ratio = int(pca["latents"]), pca["explained_ratio"]
         printed = "; in the paper, 20 explain 82 %" if published else ""
         caption = f"The {kept_latents} latents explain {100 * sum(ratio[:kept_latents]):.1f} %{printed}."
-        values = {str(place): 100 * float(share) for place, share in enumerate(ratio[:COMPONENTS], 1)}
+        values = {str(index): 100 * float(share) for index, share in enumerate(ratio[:COMPONENTS], 1)}
         title = f"Variance by principal component{', Figure 4 of the paper' if published else ''}"
         drawn.append(
             Chart(title, charts.bars(values, "principal component", "variance (%)", marked=kept_latents), caption)

@@ -64,7 +64,10 @@ class SlipLive(LiveTask):
         return SessionPlan(rig, own, {SLIP: {}, "latency": {}}, {"live_alarms_per_minute": own.alarms_per_minute})
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> SlipEngine:
-        """Return the engine of a session, which has scored its first window."""
+        """Return the engine of a session, which has scored its first window.
+
+        Raises `UsageError` if the model is the rule on forecasts.
+        """
         import numpy as np
 
         from tacpipe.tasks.slip.live.engine import SlipEngine
