@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -214,10 +214,17 @@ class Manifest:
         """Yield digest and size in bytes of every page, shard and file."""
         return ((name, size) for _, name, size in self.contents())
 
-    def reached(self, walked: dict[str, set[str]], *, lenient: bool = False) -> set[str]:
+    def reached(
+        self,
+        walked: dict[str, set[str]],
+        *,
+        lenient: bool = False,
+        read: Callable[[pages_of.Pages, int], set[str]] | None = None,
+    ) -> set[str]:
         """Return the digests of all pages, shards and files. ``walked`` caches those of pages already read, by digest.
 
-        If ``lenient``, the content of missing pages is skipped; otherwise they raise `MissingPageError`.
+        If ``lenient``, the content of missing pages is skipped; otherwise they raise `MissingPageError`. ``read``
+        returns the digests of the shards in a page, by default from its checked content.
         """
         pages = self.pages
         if pages is None:
@@ -226,8 +233,7 @@ class Manifest:
         for number, page in enumerate(pages.pages):
             if page.digest not in walked:
                 try:
-                    entries = pages.load(number).recordings.values()
-                    walked[page.digest] = {shard["digest"] for entry in entries for shard in entry["shards"].values()}
+                    walked[page.digest] = (read or pages_of.shard_digests)(pages, number)
                 except pages_of.MissingPageError:
                     if not lenient:
                         raise

@@ -556,6 +556,12 @@ def _sorted_entries(recordings: Mapping[str, RecordingEntry]) -> Iterator[tuple[
     return ((name, entry) for part in parts(recordings) for name, entry in sorted(part.items()))
 
 
+def shard_digests(pages: Pages, number: int) -> set[str]:
+    """Return the digests of the shards in a page. Raises the errors of `Pages.load`."""
+    entries = pages.load(number).recordings.values()
+    return {shard["digest"] for entry in entries for shard in entry["shards"].values()}
+
+
 class DescribedEntry(TypedDict):
     """The part of a recording that enters the digest of a dataset."""
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import io
 import json
 import os
@@ -35,6 +36,7 @@ KINDS = (
     (stat.S_ISLNK, "a symbolic link"),
 )
 BLOCK_BYTES = 1 << 20
+SMALL_BYTES = 1 << 16  # the C library takes larger buffers from the system for each read
 JSON_BYTES = 1 << 30  # maximum size of a JSON file; a manifest of a million recordings has half of it
 JSON_IN_MEMORY = 24  # maximum memory per byte of parsed JSON, reached by "[],"
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # O_NONBLOCK, because a pipe without writers would block forever
@@ -69,6 +71,24 @@ def content(path: Path | str, max_bytes: int | None = None, *, follow: bool = Tr
         with naming(path):
             data = os.read(handle, size + 1)  # one extra byte detects a larger file
             return data if len(data) == size else _read_remaining(path, handle, data, max_bytes)
+    finally:
+        os.close(handle)
+
+
+def small_file_digest(path: str) -> str:
+    """Return the sha256 of a file of up to `SMALL_BYTES`, or "" for others and for errors, which `content` reports.
+
+    It is three times as fast as hashing `content`, for commands that read each of many small files.
+    """
+    try:
+        handle = os.open(path, _FLAGS | os.O_NOFOLLOW)
+    except OSError:
+        return ""
+    try:
+        data = os.read(handle, SMALL_BYTES + 1)
+        return "" if len(data) > SMALL_BYTES or not data else hashlib.sha256(data).hexdigest()
+    except OSError:
+        return ""
     finally:
         os.close(handle)
 
@@ -152,14 +172,21 @@ def failing(path: Path | str) -> Iterator[None]:
         ) from error
 
 
-@contextlib.contextmanager
-def naming(path: Path | str) -> Iterator[None]:
+class naming:  # noqa: N801  (a context manager that is entered once per file; a generator takes five times as long)
     """Add the file's name to an `OSError` in the block; errors of reads lack it."""
-    try:
-        yield
-    except OSError as error:
-        error.filename = error.filename or os.fspath(path)
-        raise
+
+    __slots__ = ("_path",)
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
+        """Name the file of an error."""
+        if isinstance(error, OSError):
+            error.filename = error.filename or os.fspath(self._path)
 
 
 def require(path: Path | str, mode: int) -> None:

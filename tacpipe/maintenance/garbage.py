@@ -23,7 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
-from tacpipe.maintenance.sound_records import NOTE, RecordSummary, SoundRecords
+from tacpipe.maintenance.sound_records import NOTES, RecordSummary, SoundPages, SoundRecords
 from tacpipe.store import layout, presence
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
@@ -71,6 +71,7 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         pending += run.manifests
     datasets: dict[str, manifest_of.Found] = {}  # manifests in directories, by digest
     walked: dict[str, set[str]] = {}  # digests in a page, by the page's digest
+    sound = SoundPages(store)
     for root in store.roots.all():
         path = Path(root["path"])
         manifest_bytes, reached = None, root["kind"] == PUSHED
@@ -99,9 +100,10 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         )
     doubtful = _doubtful(store)
     needed.doubtful = set(doubtful)
-    needed.objects |= _closure(store, pending, datasets, walked, needed.manifests).union(*doubtful.values())
-    needed.lasting = _closure(store, list(replaced), datasets, walked, needed.manifests) - needed.objects
+    needed.objects |= _closure(store, pending, datasets, walked, sound, needed.manifests).union(*doubtful.values())
+    needed.lasting = _closure(store, list(replaced), datasets, walked, sound, needed.manifests) - needed.objects
     needed.pages, needed.replaced = set(walked), set(replaced)
+    sound.remember()
     return needed
 
 
@@ -223,6 +225,7 @@ def _closure(
     pending: list[str],
     datasets: Mapping[str, manifest_of.Found],
     walked: dict[str, set[str]],
+    sound: SoundPages,
     recording_manifests: list[Manifest],
 ) -> set[str]:
     """Return the digests of manifests, of their ancestors, and of all their objects.
@@ -240,7 +243,7 @@ def _closure(
         manifests.add(name)
         try:
             manifest = datasets[name].manifest if name in datasets else manifest_of.stored(store, name)
-            objects |= manifest.reached(walked)
+            objects |= manifest.reached(walked, read=sound.names)
         except StorageError:  # the disk failed or memory is short, so the manifest's content is unknown
             raise
         except TacpipeError as error:
@@ -348,7 +351,7 @@ def _sweep(
             _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-        presence.forget_notes(store, [NOTE, *(path.stem for path in layout.entries(store.root, "roots"))])
+        presence.forget_notes(store, [*NOTES, *(path.stem for path in layout.entries(store.root, "roots"))])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1

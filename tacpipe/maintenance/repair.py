@@ -7,7 +7,7 @@ import functools
 import os
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypedDict
@@ -18,9 +18,10 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.delivery import deliver
 from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.io import regular
 from tacpipe.io.files import readable_errors, walk, write_whole
 from tacpipe.io.hashing import file_digest
-from tacpipe.maintenance.sound_records import SoundRecords
+from tacpipe.maintenance.sound_records import SoundPages, SoundRecords
 from tacpipe.printable import plain
 from tacpipe.store import layout
 from tacpipe.store.leases import Holder
@@ -128,15 +129,19 @@ def verify(store: Store) -> Soundness:
     if not store.check():
         return Soundness(there=False)
     soundness = Soundness(foreign=layout.foreign(store.root))
-    for name in layout.names(store.root, "objects"):
-        soundness.objects += _read(store.read, name, soundness)
+    present = {
+        name
+        for name in layout.names(store.root, "objects")
+        if regular.small_file_digest(store.object_path(name)) == name or _read(store.read, name, soundness)
+    }
+    soundness.objects = len(present)
     sound = SoundRecords(store)
     for key in layout.names(store.root, "records"):
         soundness.records += _read(sound.read, key, soundness)
     sound.remember()
     store.roots.all()
     soundness.damaged += [f"root {name}" for name in store.roots.damaged()]
-    missing = set(_absent_objects(store, soundness)) - set(soundness.damaged)
+    missing = set(_absent_objects(store, soundness, present)) - set(soundness.damaged)
     # checked twice, because a root may change in between
     soundness.missing = sorted(missing & set(_absent_objects(store, soundness))) if missing else []
     return soundness
@@ -312,12 +317,12 @@ def _sound(directory: Path) -> manifest_of.Found | None:
     return dataset
 
 
-def _absent_objects(store: Store, soundness: Soundness) -> dict[str, str]:
+def _absent_objects(store: Store, soundness: Soundness, present: Collection[str] = ()) -> dict[str, str]:
     """Return the paths of missing objects that roots need, by digest: manifests, and everything in those at the paths.
 
-    Objects that the system fails to read or to find are noted in ``soundness``.
+    Objects that the system fails to read or to find are noted in ``soundness``. Those in ``present`` were just read.
     """
-    paths_by_digest = {}
+    paths_by_digest, sound = {}, SoundPages(store)
     for root in store.roots.all():
         dataset = _find(root)
         if root["kind"] == PUSHED and not store.has(root["manifest"]):
@@ -329,9 +334,12 @@ def _absent_objects(store: Store, soundness: Soundness) -> dict[str, str]:
                 paths_by_digest[manifest.content_digest] = manifest_of.NAME
             absent = [] if manifest.pages is None else manifest.pages.missing(store.has)
             paths_by_digest.update({page.digest: page.path for page in absent})
-            paths_by_digest.update({name: path for path, name in manifest.objects() if not store.has(name)})
+            names = manifest.reached({}, read=sound.names)
+            if not all(name in present or store.has(name) for name in names):
+                paths_by_digest.update({name: path for path, name in manifest.objects() if not store.has(name)})
         except StorageError as error:
             soundness.unread[root["manifest"]] = str(error)
         except TacpipeError:
             continue
+    sound.remember()
     return paths_by_digest
