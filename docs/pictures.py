@@ -75,7 +75,7 @@ def first_screen(page: Path) -> None:
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{HEIGHT}"]
         flags.append("--virtual-time-budget=10000")  # ms of virtual time, in which the page draws its charts
         subprocess.run(
-            [browser, *flags, f"--screenscreenshot={screenshot}", page.resolve().as_uri()],
+            [browser, *flags, f"--screenshot={screenshot}", page.resolve().as_uri()],
             check=True,
             capture_output=True,
             timeout=300,
