@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, NotRequired, TypedDict, cast
 
 from tacpipe.channels import arm
+from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import Dropout, PositiveFloat, PositiveInt, Seed
 from tacpipe.plugins.params import Panels, added
 from tacpipe.plugins.stage import Channels, Label, Presets, Requirements
@@ -126,8 +127,12 @@ class Change(ForwardModelParams):
         """Return these params with values of ``auto`` replaced; uses the architecture of ``start`` if it predicts change."""
         from tacpipe.models import forecasts
 
-        choice = self.architecture
-        if choice == forecasts.AUTO and isinstance(start, Change):
+        choice: str = self.architecture
+        if (
+            choice == forecasts.AUTO
+            and start is not None
+            and start.architecture in fields.choices(Change, "architecture")
+        ):
             choice = start.architecture
         architecture = cast(
             "Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolve_architecture(choice, layout)
