@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Generic, Literal
 
 import numpy as np
 
@@ -14,12 +14,20 @@ from tacpipe.metrics import pairing
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
     from tacpipe.arrays import AnyFloats
     from tacpipe.comparison.engine import Comparison, ComparisonRow
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.metrics.pairing import Measure, Sums
     from tacpipe.report.blocks import Cell, Fold
     from tacpipe.report.context import Context
+
+    Details = TypeVar("Details", default=Any)  # what the sections of a task read of a result
+else:
+    from typing import TypeVar
+
+    Details = TypeVar("Details")
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ class PredictorErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class ComparedRun:
+class ComparedRun(Generic[Details]):
     """One result: a model trained once and evaluated once."""
 
     dataset: Dataset
@@ -125,18 +133,18 @@ class ComparedRun:
     # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
     control: bool = False
     published: bool = False  # whether it was evaluated only on the recordings of the task's paper
-    details: Any = None  # data for the task's own sections
+    details: Details = None  # type: ignore[assignment]  # data for the task's own sections, if it has any
 
 
 @dataclass(frozen=True, eq=False)
-class Method:
+class Method(Generic[Details]):
     """Runs that differ only in seed or fold."""
 
     name: str
     family: str
     settings: Settings
     differing: Settings  # settings in which methods of the same first name differ
-    runs: tuple[ComparedRun, ...]
+    runs: tuple[ComparedRun[Details], ...]
 
     @property
     def control(self) -> bool:
@@ -154,7 +162,7 @@ class Method:
         return all(run.published for run in self.runs)
 
     @property
-    def details(self) -> list[Any]:
+    def details(self) -> list[Details]:
         """Details of its runs for the sections of the task."""
         return [run.details for run in self.runs]
 
@@ -166,7 +174,7 @@ class Method:
             default=str,
         )
 
-    def of(self, question: Question) -> list[ComparedRun]:
+    def of(self, question: Question) -> list[ComparedRun[Details]]:
         """Return its runs that include a question."""
         return [run for run in self.runs if question in run.questions]
 

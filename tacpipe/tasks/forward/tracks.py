@@ -197,7 +197,7 @@ class Track:
 def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -> TacpipeError:
     """Return the error for recordings without a window, with gaps that may be the cause.
 
-    ``beginning`` is the start of the message, such as ``The training recordings hold``.
+    ``beginning`` is the start of the message, such as ``The training recordings contain``.
     """
     gaps = streams.describe_gaps(*(recording.columns() for recording in recordings.recordings.values()))
     advice = gaps or ["Give more or longer recordings, or shorten context and horizon."]

@@ -111,7 +111,7 @@ def train(
     )
     for role, dataset, windows in (("training", training, training_rows), ("validation", validation, validation_rows)):
         if not len(windows.starts):
-            raise tracks.no_window(f"The {role} recordings hold", dataset, params.context, params.horizon)
+            raise tracks.no_window(f"The {role} recordings contain", dataset, params.context, params.horizon)
     _check_channels(codec, parts[0])
     build = partial(_built, params, codec, training_rows, start, device)
     schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)

@@ -131,7 +131,7 @@ class UnknownMeasures(TypedDict):
     Rates include their number of slides and the bounds of their 95 % interval.
     """
 
-    rule: str
+    rule: Literal["probability", "distance"]
     threshold: float
     false_unknown: NotRequired[float]
     false_unknown_n: NotRequired[int]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, ComparedRun, Kind, Method, Question, TaskReport
+from tacpipe.comparison.runs import MODEL, Kind, Question, TaskReport
 from tacpipe.metrics import pairing
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts
@@ -19,7 +19,7 @@ from tacpipe.report.context import Context
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
 from tacpipe.tasks.forward.report import events, figures, methods, representations, skill
-from tacpipe.tasks.forward.report.methods import ACTIONS, shown_steps
+from tacpipe.tasks.forward.report.methods import ACTIONS, ComparedRun, Method, shown_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable

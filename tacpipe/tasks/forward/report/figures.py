@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method
+from tacpipe.comparison.runs import MODEL
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Cell, Chart, Charts, Fold, SmallPrint, Table, counted, fold, number, table
 from tacpipe.report.charts import Curve
@@ -18,7 +18,7 @@ from tacpipe.report.context import Context, loss_chart, median_run
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import ForwardMetrics, ForwardScores, IntervalsByStep
 from tacpipe.tasks.forward.report import methods
-from tacpipe.tasks.forward.report.methods import ForwardResult
+from tacpipe.tasks.forward.report.methods import ComparedRun, ForwardResult, Method
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -233,7 +233,7 @@ def draw_traces(
 
 
 TRACE_STEPS = (1, 5, 10)
-LOSS_NAMES = {"training": "train_loss", "validation": "val_loss"}
+LOSS_NAMES: Mapping[str, Literal["train_loss", "val_loss"]] = {"training": "train_loss", "validation": "val_loss"}
 
 
 def paper_representative(context: Context) -> Method | None:

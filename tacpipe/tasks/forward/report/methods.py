@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question, Settings
+from tacpipe.comparison import runs
+from tacpipe.comparison.runs import PredictorErrors, Question, Settings
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
 from tacpipe.report.context import drop_duplicates
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import AnyFloats
-    from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
 
 
@@ -183,6 +183,10 @@ class ForwardResult(context.ReportResult[ForwardConfig]):
         if self.epochs_of_paper:
             parts.append(self.epochs_of_paper)
         return " · ".join(parts)
+
+
+Method = runs.Method[ForwardResult]
+ComparedRun = runs.ComparedRun[ForwardResult]
 
 
 def has_error_sums(dataset: Dataset) -> bool:

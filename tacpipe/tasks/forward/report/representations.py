@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.codecs.measures import Reconstruction, StoredCodec
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Spread, spread
+from tacpipe.comparison.runs import MODEL, Spread, spread
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, Table, fold, number, table
 from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, is_published
 from tacpipe.tasks.forward.report import methods
+from tacpipe.tasks.forward.report.methods import ComparedRun, Method
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset

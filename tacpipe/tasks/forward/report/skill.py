@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import ComparisonRow
-from tacpipe.comparison.runs import MODEL, Method
+from tacpipe.comparison.runs import MODEL
 from tacpipe.metrics import calibration, intervals, pairing
 from tacpipe.metrics.calibration import COVERAGE_FILE, Band
 from tacpipe.metrics.intervals import Interval
@@ -21,13 +21,13 @@ from tacpipe.report.context import Context, band_fold, read_coverage
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE, PARTS, Parts
 from tacpipe.tasks.forward.report import methods
+from tacpipe.tasks.forward.report.methods import ComparedRun, Method
 from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from tacpipe.arrays import AnyFloats
-    from tacpipe.comparison.runs import ComparedRun
     from tacpipe.metrics.pairing import Sums
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Ints
-from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, counted, fold, form, listed
 from tacpipe.report.charts import Curve
@@ -18,6 +17,7 @@ from tacpipe.report.context import Context, curves_of_methods, is_published, los
 from tacpipe.tasks.material.report import scores
 from tacpipe.tasks.material.report.methods import (
     MaterialResult,
+    Method,
     has_usual_settings,
     method_title,
     ordered_sensors,

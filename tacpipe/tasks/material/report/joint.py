@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.metrics.intervals import wilson
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint, Table, number, p_value, signed
@@ -16,6 +15,8 @@ from tacpipe.report.context import SHORTENED
 from tacpipe.tasks.material.headline import HeldOutAccuracy, ZeroShotAccuracy
 from tacpipe.tasks.material.report import figures, scores
 from tacpipe.tasks.material.report.methods import (
+    ComparedRun,
+    Method,
     has_usual_settings,
     ordered_sensors,
     runs_on,

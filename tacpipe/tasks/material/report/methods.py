@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, Kind, Method, PredictorErrors, Question, Settings, marks
+from tacpipe.comparison import runs
+from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings, marks
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
@@ -101,6 +102,10 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
         layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
         scheme = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
         return scheme, "authors" if "authors" in layouts else "time"
+
+
+Method = runs.Method[MaterialResult]
+ComparedRun = runs.ComparedRun[MaterialResult]
 
 
 def settings(results: Sequence[MaterialResult]) -> list[Settings]:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
-from tacpipe.comparison.runs import Method
 from tacpipe.metrics import calibration, headline
 from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Curve
-from tacpipe.tasks.material.report.methods import runs_on, sensor_title, sensors_of
+from tacpipe.tasks.material.report.methods import Method, runs_on, sensor_title, sensors_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -161,8 +160,8 @@ def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float
     """Return mean confidence and accuracy of each bin of the uncalibrated probabilities."""
     sums: dict[int, list[float]] = {}
     for run in runs_on(method, sensor):
-        tree = run.details.metrics.get("calibration", {}).get(sensor, {}).get("before", {})
-        for bin_tree in tree.get("reliability", []):
+        measured = run.details.metrics.get("calibration", {}).get(sensor)
+        for bin_tree in measured["before"]["reliability"] if measured else []:
             bin_index = min(int(bin_tree["confidence"] * calibration.BINS), calibration.BINS - 1)
             total = sums.setdefault(bin_index, [0.0, 0.0, 0.0])
             for at, value in enumerate((1.0, bin_tree["confidence"], bin_tree["accuracy"])):
@@ -199,20 +198,22 @@ def _table_row(method: Method, sensor: str, answers: pd.DataFrame) -> Sequence[s
     """Return a row of the table."""
     trees = [run.details.metrics for run in runs_on(method, sensor)]
     measured = [tree["calibration"][sensor] for tree in trees if sensor in tree.get("calibration", {})]
-    refused = [tree.get("unknown", {}).get(sensor, {}) for tree in trees]
+    refused = [tree["unknown"][sensor] for tree in trees if sensor in tree.get("unknown", {})]
     areas = [tree["auroc"][tree["rule"]] for tree in refused if "auroc" in tree]
 
-    def mean(measure: str) -> Cell:
+    def mean(measure: Literal["calibration_error", "log_loss"]) -> Cell:
         if not measured:
             return Cell(NONE)
-        before, after = (float(np.mean([tree[when][measure] for tree in measured])) for when in ("before", "after"))
+        parts = [(tree["before"][measure], tree["after"][measure]) for tree in measured]
+        before, after = map(float, np.mean(parts, axis=0))
         return Cell(number(after, 3).text, f"{number(before, 3).text} as trained", after)
 
     known_rows, unknown_rows = answers[answers.known], answers[~answers.known]
     return [
         f"{sensor_title(sensor)}: {method.name}",
         f"{known_rows.recording.nunique():,}",
-        *map(mean, ("calibration_error", "log_loss")),
+        mean("calibration_error"),
+        mean("log_loss"),
         _rate_cell(rate_of(known_rows, "refused")),
         _rate_cell(rate_over_materials(unknown_rows.assign(named_known=~unknown_rows.refused), "named_known")),
         number(float(np.mean(areas)), 3) if areas else Cell(NONE),

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import PairedRuns, observations, paired_runs
-from tacpipe.comparison.runs import ComparedRun, Method, Question
+from tacpipe.comparison.runs import Question
 from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.metrics.pairing import Gain
 from tacpipe.report import context
 from tacpipe.report.blocks import NONE, Cell, fixed
 from tacpipe.tasks.material.report import methods
-from tacpipe.tasks.material.report.methods import has_usual_settings, question_on, runs_on
+from tacpipe.tasks.material.report.methods import ComparedRun, Method, has_usual_settings, question_on, runs_on
 from tacpipe.tasks.material.report.predictions import LEVEL, MODEL
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import ComparedRun, TaskReport
+from tacpipe.comparison.runs import TaskReport
 from tacpipe.metrics import headline
 from tacpipe.report import blocks, screen
 from tacpipe.report.blocks import NONE, Cell, Charts, Fold
@@ -16,6 +16,7 @@ from tacpipe.report.context import Context
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.report import figures, methods, predictions, quantiles
 from tacpipe.tasks.touch.report.methods import (
+    ComparedRun,
     caution,
     default_method,
     describe_split,

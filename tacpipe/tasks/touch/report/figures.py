@@ -14,7 +14,6 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.comparison.runs import Method
 from tacpipe.metrics import regression
 from tacpipe.report import blocks, charts, context
 from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold
@@ -23,6 +22,7 @@ from tacpipe.tasks.touch.headline import CONSTANT, MODEL
 from tacpipe.tasks.touch.params import PAPER
 from tacpipe.tasks.touch.report import methods, paper, predictions
 from tacpipe.tasks.touch.report.methods import (
+    Method,
     TouchResult,
     describe_training,
     one_per_architecture,

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, Settings, distinct_names, marks
+from tacpipe.comparison import runs
+from tacpipe.comparison.runs import PredictorErrors, Question, Settings, distinct_names, marks
 from tacpipe.io import Scalar
 from tacpipe.metrics import regression
 from tacpipe.plugins import params as params_of
@@ -74,6 +75,10 @@ class TouchResult(context.ReportResult[TouchConfig]):
             params[SHORTENED] = self.epochs_of_paper
             params.pop("epochs")
         return {**params, "architecture": self.architecture, "split": self.split, "simulated": self.simulated}
+
+
+Method = runs.Method[TouchResult]
+ComparedRun = runs.ComparedRun[TouchResult]
 
 
 def method_names(results: Sequence[TouchResult]) -> list[str]:

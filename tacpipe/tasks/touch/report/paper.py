@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from tacpipe.comparison.runs import Method
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, SmallPrint, Table
 from tacpipe.report.charts import Dot
@@ -16,6 +15,7 @@ from tacpipe.tasks.touch.params import DEFAULT, PAPER
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.methods import (
     BASELINES,
+    Method,
     baseline_name,
     caution,
     describe_training,

@@ -9,7 +9,6 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.runs import Method
 from tacpipe.metrics import calibration
 from tacpipe.metrics.calibration import Band
 from tacpipe.report import blocks, charts
@@ -19,7 +18,7 @@ from tacpipe.report.context import band_fold, read_coverage
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report import figures
-from tacpipe.tasks.touch.report.methods import FINGER_NAMES, describe_split, ordered_splits
+from tacpipe.tasks.touch.report.methods import FINGER_NAMES, Method, describe_split, ordered_splits
 
 if TYPE_CHECKING:
     import pandas as pd
