@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacpipe.report.blocks import Cell, Fold
     from tacpipe.report.context import Context
 
-    Details = TypeVar("Details", default=Any)  # what the sections of a task read of a result
+    Details = TypeVar("Details", default=Any)  # data for the task's own sections
 else:
     from typing import TypeVar
 
