@@ -87,8 +87,8 @@ unknown-materials: $(VENV)/.dev ## measure the answer unknown with materials lef
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-live-demo: $(VENV)/.dev ## emulate the first paper's rig with slips and forecast them live for 60 s; a summary and live-demo/live.png
-	@$(BIN)/python -m tacpipe.tasks.forward.live.demo live-demo rigs/first-paper.toml
+live-demo: $(VENV)/.dev ## emulate the first paper's rig with slips and predict them live for 60 s; a summary and live-demo/live.png
+	@$(BIN)/python -m tacpipe.tasks.slip.live.demo live-demo rigs/first-paper.toml
 
 test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 5 minutes on 2 cores
 	@$(PYTEST) -m "not faults and not long and not rig"

@@ -48,7 +48,7 @@ def read_labels(recording: Recording) -> SlipLabels | None:
         return None
     if any((values < 0).any() for _, values in found):
         return None
-    return SlipLabels(_merged([runs(t_ns, values > 0) for t_ns, values in found]), contact)
+    return SlipLabels(merge_events([runs(t_ns, values > 0) for t_ns, values in found]), contact)
 
 
 def runs(t_ns: Times, active: Bools) -> Times:
@@ -61,7 +61,7 @@ def runs(t_ns: Times, active: Bools) -> Times:
     return np.stack([t_ns[edges[::2]], t_ns[edges[1::2] - 1]], axis=1).astype(np.int64)
 
 
-def _merged(parts: Sequence[Times]) -> Times:
+def merge_events(parts: Sequence[Times]) -> Times:
     """Return the union of intervals (event, 2), those closer than `MERGED_NS` as one."""
     events: list[list[int]] = []
     for begin, end in sorted(tuple(row) for part in parts for row in part.tolist()):

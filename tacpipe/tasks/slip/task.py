@@ -9,6 +9,7 @@ from tacpipe.tasks.slip.params import Params
 from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
+    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
@@ -99,3 +100,10 @@ class SlipTask(Task):
         from tacpipe.tasks.slip.live.task import SlipLive
 
         return SlipLive()
+
+    @property
+    def report(self) -> TaskReport:
+        """Report of prediction, detection and alarms, with their controls."""
+        from tacpipe.tasks.slip.report import SlipReport
+
+        return SlipReport(self.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.tasks.slip import training
-from tacpipe.tasks.slip.live import evaluation
+from tacpipe.tasks.slip.calibration import EventScore
+from tacpipe.tasks.slip.live import demo, evaluation
 from tacpipe.tasks.slip.live.engine import FingerSoFar, SlipEngine
+from tacpipe.tasks.slip.live.evaluation import SessionAlarms
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tacpipe.tasks.slip.live.task import SlipLive, SlipSettings
 from tacpipe.tasks.slip.model import SlipModel
@@ -219,3 +222,14 @@ def test_a_model_trained_behind_a_stage_has_no_causal_predictions() -> None:
 
 def test_the_options_of_a_session_are_those_of_its_settings() -> None:
     assert SlipSettings().alarms_per_minute == 1.0
+
+
+def test_the_picture_of_the_demo_shows_each_slip(tmp_path: Path) -> None:
+    import pandas as pd
+
+    t_ns = np.arange(200, dtype=np.int64) * PERIOD_NS
+    stream = pd.DataFrame({"t_device_ns": t_ns, "probability": np.linspace(0, 1, 200), "alarm": np.arange(200) > 150})
+    events = np.array([[t_ns[160], t_ns[165]]])
+    event = EventScore("a", "b", t_ns[160] / 1e9, 180.0, 0.0, 280.0)
+    path = demo.draw(tmp_path / "live.png", stream, events, SessionAlarms([event], 0, 0.05), "one slip")
+    assert path.read_bytes().startswith(b"\x89PNG")

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.arrays import Bools, Times
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.live.messages import SLIP
 from tacpipe.tasks.slip.model import SlipModel
+from tacpipe.tasks.slip.windows import GraspTrack
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
@@ -73,7 +76,8 @@ def _session(model: SlipModel, recording: Recording) -> dict[str, Any]:
     }
     track = model.reader.track(recording)
     if track.labels is not None:
-        session["alarms"] = _alarms(model, recording, times, published["alarm"][answered] > 0)
+        alarms = score_session(model, track, times, published["alarm"][answered] > 0)
+        session["alarms"] = alarms.to_json()
     return session
 
 
@@ -90,31 +94,40 @@ def _quantiles(latency_ms: Any) -> dict[str, float]:
     }
 
 
-def _alarms(model: SlipModel, recording: Recording, times: Any, on: Any) -> dict[str, Any]:
-    """Return how the published alarm did on the labelled slips."""
-    track = model.reader.track(recording)
+@dataclass(frozen=True)
+class SessionAlarms:
+    """How a published alarm did."""
+
+    events: list[EventScore]
+    false_alarms: int
+    minutes: float  # stable contact
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as JSON; null where there is none."""
+        slips = [
+            {
+                name: round(value, 3) if value == value else None
+                for name, value in dataclasses.asdict(event).items()
+                if isinstance(value, float)
+            }
+            for event in self.events
+        ]
+        return {"slips": slips, "false_alarms": self.false_alarms, "minutes": round(self.minutes, 4)}
+
+
+def score_session(model: SlipModel, track: GraspTrack, times: Times, on: Bools) -> SessionAlarms:
+    """Return how an alarm that was ``on`` (row,) at ``times`` (row,) did on the labelled slips of a track."""
     states = track.states(model.horizon_ns, round(model.params.recovery_s * 1e9))
     rows = np.clip(np.searchsorted(track.t_ns, times), 0, len(track.t_ns) - 1)
     scored = ScoredTrack(
-        recording.name,
+        track.name,
         track.object,
         times,
         states[rows],
-        on.astype(float),
+        on.astype(np.float64),
         track.events,
         np.ones(len(times)),
         track.since_s[rows],
     )
-    events: list[EventScore] = score_events(scored, 0.5, model.horizon_ns)
-    return {
-        "slips": [
-            {
-                key: round(value, 3) if value == value else None
-                for key, value in dataclasses.asdict(event).items()
-                if isinstance(value, float)
-            }
-            for event in events
-        ],
-        "false_alarms": false_alarms(scored, 0.5, model.horizon_ns),
-        "minutes": round(stable_minutes([scored]), 4),
-    }
+    events = score_events(scored, 0.5, model.horizon_ns)
+    return SessionAlarms(events, false_alarms(scored, 0.5, model.horizon_ns), stable_minutes([scored]))

@@ -1,0 +1,189 @@
+"""A live session without hardware: `make live-demo`.
+
+A model is trained on simulated trials whose slips the planned motion causes. Then the first paper's rig is emulated with
+further such trials, and the session runs on it. At the end, the slips of the simulation and the alarms are printed, and
+drawn. Seeds and parameters of the simulation are those of the constants below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Times
+from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
+from tacpipe.recording import rig as rigs
+from tacpipe.simulation import pick_and_move
+from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.simulation.emulation.world import World
+from tacpipe.tasks.slip.calibration import EventScore
+from tacpipe.tasks.slip.labels import SlipLabels, merge_events, runs
+from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
+from tacpipe.tasks.slip.model import SlipModel
+
+TRIALS, TRAINING_SEED = 80, 0
+EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
+SEED = 7  # of the emulated world
+LIVE_S = 60.0
+PER_MINUTE = "1"  # false alarms that the alarm was set for
+TRAINING = (
+    *("--streams", "xela*", "--window-s", "0.5", "--horizon-s", "0.3", "--recovery-s", "0.3", "--no-match-time"),
+    *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2"),
+)
+SWITCH_S = 0.0005
+BEFORE_MS, AFTER_MS = 500.0, 200.0  # time around a slip that is drawn enlarged
+MAX_DRAWN_SLIPS = 6
+LINE, ALARM, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
+
+
+def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
+    """Train, emulate, run live, print what the alarm did, and return the path of the picture.
+
+    Raises `TacpipeError` if a command fails.
+    """
+    _train(output)
+    world = World(SEED, pick_and_move.PickRig(effort=EFFORT))
+    sys.setswitchinterval(SWITCH_S)
+    with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
+        (output / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
+        _tacpipe(
+            *(
+                "live",
+                str(output / "emulated" / "rig.toml"),
+                "--model",
+                str(output / "model"),
+                "-o",
+                str(output / "live"),
+            ),
+            *("--duration-s", f"{seconds:g}", "--alarms-per-minute", PER_MINUTE),
+        )
+        epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
+    return _show(output, world, epoch_ns)
+
+
+def _train(output: Path) -> None:
+    """Simulate trials and train on them; stored results are reused."""
+    recordings, split = str(output / "recordings"), str(output / "split")
+    options = ("--trials", str(TRIALS), "--seed", str(TRAINING_SEED), "--effort", str(EFFORT))
+    _tacpipe("simulate", "forward", *options, "-o", recordings, "--quiet")
+    _tacpipe("split", recordings, "-o", split, "--scheme", "random", "--val", "0.25", "--test", "0")
+    _tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *TRAINING, "--quiet")
+
+
+def _tacpipe(*words: str) -> None:
+    terminal.note("$ tacpipe " + " ".join(words))
+    code = subprocess.run([sys.executable, "-m", "tacpipe", *words], stdout=subprocess.DEVNULL, check=False).returncode
+    if code:
+        raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
+
+
+def _show(output: Path, world: World, epoch_ns: int) -> Path:
+    """Print and draw the last session next to the slips of the simulation."""
+    import tacpipe
+
+    recordings = tacpipe.open(output / "live")
+    recording = recordings[max(recordings.recordings)]
+    model = SlipModel.load(tacpipe.open(output / "model").files)
+    stream = recording.table("slip").to_pandas()
+    t_ns = stream["t_device_ns"].to_numpy()
+    truth_ns = np.arange(int(t_ns[0]), int(t_ns[-1]), 1_000_000, dtype=np.int64)
+    slipping = world.contact(truth_ns - epoch_ns, lambda scene: scene.contact.slip.astype(np.float64)) > 0.5
+    track = dataclasses.replace(
+        model.reader.track(recording), labels=SlipLabels(merge_events([runs(truth_ns, slipping)]), None)
+    )
+    answered = stream["alarm"].to_numpy() >= 0
+    alarms = score_session(model, track, t_ns[answered], stream["alarm"].to_numpy()[answered] > 0)
+    latency_ms = recording.table("latency")["latency_ms"].to_numpy()
+    text = described(alarms)
+    terminal.note(f"\n{text}\n{latency_in_words(latency_ms)}")
+    return draw(output / "live.png", stream, track.events, alarms, text)
+
+
+def described(alarms: SessionAlarms) -> str:
+    """Return what an alarm did in words.
+
+    >>> event = EventScore("a", "b", 1.0, 120.0, 0.0, 200.0)
+    >>> missed = EventScore("a", "b", 1.0, float("nan"), 30.0, 50.0)
+    >>> described(SessionAlarms([event, missed], 1, 0.5))
+    'alarm before 1 of 2 slips, 60 ms or more before 1; median lead 120 ms; 1 false alarm in 30 s of other contact'
+    """
+    leads = [event.lead_ms for event in alarms.events if event.lead_ms == event.lead_ms]
+    median = f"; median lead {np.median(leads):.0f} ms" if leads else ""
+    false = f"{alarms.false_alarms} false alarm{'' if alarms.false_alarms == 1 else 's'}"
+    return (
+        f"alarm before {len(leads)} of {len(alarms.events)} slips, 60 ms or more before {sum(lead >= 60 for lead in leads)}"
+        f"{median}; {false} in {60 * alarms.minutes:.0f} s of other contact"
+    )
+
+
+def latency_in_words(latency_ms: AnyFloats) -> str:
+    """Return median, 99th percentile and maximum of latencies; NaN is left out.
+
+    >>> latency_in_words(np.array([1.0, 3.0, np.nan]))
+    'latency: median 2.0 ms, 99 % 3.0 ms, largest 3.0 ms, of 2 probabilities'
+    """
+    finite = latency_ms[np.isfinite(latency_ms)]
+    if not len(finite):
+        return "latency: no probability"
+    median, most, largest = np.median(finite), np.quantile(finite, 0.99), finite.max()
+    return (
+        f"latency: median {median:.1f} ms, 99 % {most:.1f} ms, largest {largest:.1f} ms, of {len(finite)} probabilities"
+    )
+
+
+def draw(path: Path, stream: Any, events: Times, alarms: SessionAlarms, headline: str) -> Path:
+    """Draw the probability of a session with its alarms and the slips of the simulation, and each slip enlarged."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    t_ns, probability = stream["t_device_ns"].to_numpy(), stream["probability"].to_numpy()
+    on = stream["alarm"].to_numpy() > 0
+    near = events[:MAX_DRAWN_SLIPS]
+    figure = pyplot.figure(figsize=(12, 6.5), layout="constrained")
+    grid = figure.add_gridspec(2, max(1, len(near)))
+    upper = figure.add_subplot(grid[0, :])
+    figure.suptitle(headline, x=0.01, ha="left")
+    at_s = (t_ns - t_ns[0]) / 1e9
+    upper.plot(at_s, probability, color=LINE, linewidth=0.8)
+    upper.plot(at_s[on], probability[on], ".", color=ALARM, markersize=5, label="alarm")
+    for number, (begin, end) in enumerate(((events - t_ns[0]) / 1e9).tolist()):
+        upper.axvspan(begin, max(end, begin + 0.05), color=SLIPPED, alpha=0.5, label="slip" if not number else None)
+    upper.set_ylim(0, 1)
+    upper.set_xlabel("time, s")
+    upper.set_ylabel("probability of a slip")
+    upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
+    for place, begin in enumerate(near[:, 0].tolist()):
+        axes = figure.add_subplot(grid[1, place])
+        since_ms = (t_ns - begin) / 1e6
+        rows = (since_ms >= -BEFORE_MS) & (since_ms <= AFTER_MS)
+        axes.axvline(0.0, color=SLIPPED, linewidth=2)
+        axes.plot(since_ms[rows], probability[rows], color=LINE, linewidth=1)
+        axes.plot(since_ms[rows & on], probability[rows & on], "o", color=ALARM, markersize=4)
+        axes.set_xlim(-BEFORE_MS, AFTER_MS)
+        axes.set_ylim(0, 1)
+        axes.set_xlabel("ms from the slip")
+        axes.set_title(_lead_in_words(alarms.events, (begin - t_ns[0]) / 1e9))
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+    return path
+
+
+def _lead_in_words(events: list[EventScore], begin_s: float) -> str:
+    """Return by how much the alarm led the slip that begins at a time since the start of the session."""
+    event = min(events, key=lambda event: abs(event.begins_s - begin_s), default=None)
+    if event is None or abs(event.begins_s - begin_s) > 1:
+        return "no probability before"
+    return "not led" if event.lead_ms != event.lead_ms else f"led by {event.lead_ms:.0f} ms"
+
+
+if __name__ == "__main__":
+    terminal.result(run(Path(sys.argv[1]), Path(sys.argv[2])))

@@ -1,0 +1,61 @@
+"""The report of slip results: folds are pooled, and controls are marked."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tacpipe.comparison.runs import Method
+from tacpipe.tasks.slip import evaluation, training
+from tacpipe.tasks.slip.params import Boosting
+from tacpipe.tasks.slip.report import ALARM_HEADS, SlipReport, alarm_table, area_table, pooled_metrics
+from tests.fake_recordings import FakeDataset, dataset
+from tests.tasks.slip.slip_recordings import trials
+
+SMALL = Boosting(trees=10, leaves=4, leaf=10, learning_rate=0.3)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """Two folds of one method, and a control of shuffled labels."""
+    folder = tmp_path_factory.mktemp("workspace")
+    files = training.train(SMALL, dataset(*trials(12)), None, folder / "a")
+    shuffled = training.train(dataclasses.replace(SMALL, labels="shuffled"), dataset(*trials(12)), None, folder / "b")
+    return [
+        FakeDataset(files=evaluation.evaluate(model, dataset(*trials(6, first))).files)
+        for model, first in ((files, 100), (files, 200), (shuffled, 100))
+    ]
+
+
+def test_runs_have_the_brier_score_of_each_predictor_and_the_control_is_marked(results: list[Any]) -> None:
+    without_windows: Any = FakeDataset()
+    runs = SlipReport("slip").read([*results, without_windows])
+    assert [run.control for run in runs] == [False, False, True]
+    (errors,) = runs[0].questions.values()
+    metrics = json.loads(results[0].files["metrics.json"])
+    for predictor in ("model", "time_only", "constant"):
+        score = errors.measure.score_of(errors.sums[predictor].values())
+        assert score == pytest.approx(metrics[predictor]["brier"], abs=1e-5)
+
+
+def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[Any]) -> None:
+    runs = SlipReport("slip").read(results[:2])
+    pooled = pooled_metrics(Method("boosting", "", {}, {}, tuple(runs)))
+    assert pooled["counts"]["recordings"] == 12
+    assert pooled["counts"]["slips"] == 6
+    areas = area_table(pooled)
+    assert list(areas.heads) == ["windows", "model", "shear over load", "time only", "total change", "constant"]
+    alarms = alarm_table(pooled)
+    assert len(alarms.rows) == 3
+    assert all(len(row.cells) == len(ALARM_HEADS) + 1 for row in alarms.rows)
+
+
+def test_the_report_needs_no_torch(tmp_path: Path) -> None:
+    from tests.conftest import run_python
+
+    lines = "import sys, tacpipe.tasks.slip.report; print('torch' in sys.modules)"
+    assert run_python(tmp_path, "-c", lines, check=True).stdout == "False\n"
