@@ -94,7 +94,7 @@ def fenced_blocks(text: str) -> list[Block]:
     return [Block(language, code, title, mark) for mark, language, title, code in matches]
 
 
-def joined(text: str) -> str:
+def join_parts(text: str) -> str:
     """Return commands that continue on the next line as one line each."""
     return re.sub(r" *\\\n +", " ", text)
 
@@ -105,7 +105,7 @@ MORE = "…"  # This stands in a page for further lines that a command prints.
 def printed_commands(block: str) -> list[tuple[str, list[str]]]:
     """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
     outputs: list[tuple[str, list[str]]] = []
-    for line in joined(block).splitlines():
+    for line in join_parts(block).splitlines():
         if line.startswith("$ "):
             outputs.append((line.removeprefix("$ "), []))
         elif line:
@@ -234,7 +234,7 @@ def test_the_commands_in_all_pages_exist(lab: Lab) -> None:
     lines_of_pages = []
     for page in PAGES:
         text = page.read_text()
-        lines = [line.split("#")[0] for block in blocks(text, "sh") for line in joined(block).splitlines()]
+        lines = [line.split("#")[0] for block in blocks(text, "sh") for line in join_parts(block).splitlines()]
         lines_of_pages += [line for line in lines if line.startswith("tacpipe ")] + re.findall(
             r"`(tacpipe [^`]+)`", text
         )

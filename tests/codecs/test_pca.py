@@ -27,17 +27,17 @@ def fit(content: np.ndarray, **options: float | str) -> pca.PCA:
     return pca.fit(Moments.from_pieces([content], len(CHANNELS)), CHANNELS, LAYOUT, **options)  # type: ignore[arg-type]
 
 
-def standardised(content: np.ndarray) -> np.ndarray:
+def standardise(content: np.ndarray) -> np.ndarray:
     scaled: np.ndarray = (content - content.mean(axis=0)) / content.std(axis=0)
     return scaled
 
 
 def test_latents_are_those_of_sklearn_on_standardised_channels_up_to_sign() -> None:
     content = values()
-    oracle = decomposition.PCA(4).fit(standardised(content))
+    oracle = decomposition.PCA(4).fit(standardise(content))
     fitted = fit(content, components=4)
     signs = np.sign((fitted.components * oracle.components_).sum(axis=1))
-    assert np.allclose(fitted.encode(content, CHANNELS), oracle.transform(standardised(content)) * signs, atol=1e-4)
+    assert np.allclose(fitted.encode(content, CHANNELS), oracle.transform(standardise(content)) * signs, atol=1e-4)
     assert np.allclose(fitted.explained_ratio[:4], oracle.explained_variance_ratio_)
 
 
@@ -52,16 +52,14 @@ def test_a_share_of_variance_keeps_as_few_latents_as_hold_it() -> None:
     fitted = fit(content, variance=0.9)
     count = len(fitted.components)
     assert (
-        count
-        == int(np.searchsorted(ratios, 0.9)) + 1
-        == decomposition.PCA(0.9).fit(standardised(content)).n_components_
+        count == int(np.searchsorted(ratios, 0.9)) + 1 == decomposition.PCA(0.9).fit(standardise(content)).n_components_
     )
     assert fitted.explained_ratio[:count].sum() >= 0.9
 
 
 def test_the_ratios_are_those_of_all_components_and_not_only_of_those_kept() -> None:
     content = values()
-    oracle = decomposition.PCA().fit(standardised(content)).explained_variance_ratio_
+    oracle = decomposition.PCA().fit(standardise(content)).explained_variance_ratio_
     fitted = fit(content, components=2)
     assert np.allclose(fitted.explained_ratio, oracle)
     assert np.allclose(json.loads(fitted.to_files()["codec.json"])["explained_ratio"], oracle, atol=1e-9)

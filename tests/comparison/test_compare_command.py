@@ -31,7 +31,7 @@ def dataset(data: str = "d" * 64) -> Any:
     return SimpleNamespace(source=SimpleNamespace(inputs={"datasets": [{"dataset": data, "manifest": data}]}))
 
 
-def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, ComparedRun]:
+def weigh(errors: list[float], path: str, data: str = "d" * 64, **about: Any) -> tuple[str, ComparedRun]:
     return path, run({"model": errors, "mean": BASE}, dataset=dataset(data), **about)
 
 
@@ -47,9 +47,9 @@ def lines(comparison: Compared, width: int = 120) -> list[list[str]]:
 
 
 WIDTHS = (
-    weighed(LARGE, "r/large/0", settings={"width": 8, "deep": True}, seed=0),
-    weighed(LARGE, "r/large/1", settings={"width": 8, "deep": True}, seed=1),
-    weighed(SMALL, "r/small/0", settings={"width": 4, "deep": True}, seed=0),
+    weigh(LARGE, "r/large/0", settings={"width": 8, "deep": True}, seed=0),
+    weigh(LARGE, "r/large/1", settings={"width": 8, "deep": True}, seed=1),
+    weigh(SMALL, "r/small/0", settings={"width": 4, "deep": True}, seed=0),
 )
 
 
@@ -72,8 +72,8 @@ def test_without_pooling_each_result_is_a_row_named_by_its_path_with_its_seed() 
 
 
 def test_data_is_a_column_where_results_are_of_other_data() -> None:
-    alike = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "1" * 64, method="other"))
-    other_data = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "2" * 64, method="other"))
+    alike = compared(weigh(LARGE, "a", "1" * 64), weigh(SMALL, "b", "1" * 64, method="other"))
+    other_data = compared(weigh(LARGE, "a", "1" * 64), weigh(SMALL, "b", "2" * 64, method="other"))
 
     assert "data" not in lines(alike)[0]
     assert lines(other_data)[0][0] == "data" and lines(other_data)[2][1] == "2" * 8
@@ -83,8 +83,8 @@ def test_data_is_a_column_where_results_are_of_other_data() -> None:
 
 def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interval() -> None:
     named_results = [
-        weighed(LARGE, "a", question=Question("known")),
-        weighed(SMALL, "b", question=Question("unseen")),
+        weigh(LARGE, "a", question=Question("known")),
+        weigh(SMALL, "b", question=Question("unseen")),
     ]
     comparison = compared(*named_results)
 
@@ -95,7 +95,7 @@ def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interva
 
 
 def test_too_few_recordings_for_a_verdict_are_stated() -> None:
-    comparison = compared(weighed(SMALL[:3], "a"))
+    comparison = compared(weigh(SMALL[:3], "a"))
     assert f"below {headline.MIN_CLUSTERS}" in comparison.tables()[0].caption
     assert "below" not in compared(*WIDTHS).tables()[0].caption
 
@@ -162,14 +162,14 @@ def test_errors_in_other_units_are_other_comparisons_with_their_own_unit() -> No
     """The runs share method, settings and question, and one of them has ten times the error in another unit."""
 
     def in_millinewton(path: str, errors: list[float]) -> tuple[str, ComparedRun]:
-        place, newton = weighed(errors, path)
+        place, newton = weigh(errors, path)
         question, of_question = next(iter(newton.questions.items()))
         measure = dataclasses.replace(of_question.measure, unit="mN")
         return place, dataclasses.replace(
             newton, questions={question: dataclasses.replace(of_question, measure=measure)}
         )
 
-    comparison = compared(weighed(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
+    comparison = compared(weigh(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
     first, second = comparison.tables()
     assert "Units: N." in first.caption and "Units: mN." in second.caption
     assert [[float(row.cells[1]) for row in table.groups[0].rows] for table in (first, second)] == [

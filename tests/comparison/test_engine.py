@@ -18,12 +18,12 @@ BASE = RNG.gamma(4.0, 1.0, 20)
 GOOD = BASE * RNG.uniform(0.5, 0.9, 20)
 
 
-def compared(*runs: object) -> engine.Comparison:
+def compare(*runs: object) -> engine.Comparison:
     return engine.compare_on(report_on("weighing"), grouped(runs), QUESTION)  # type: ignore[arg-type]
 
 
 def test_the_rows_are_the_methods_and_baselines_with_their_errors_the_best_first() -> None:
-    comparison = compared(run({"model": GOOD, "still": BASE, "far": 3 * BASE}), run({"model": 2 * GOOD}, "wide"))
+    comparison = compare(run({"model": GOOD, "still": BASE, "far": 3 * BASE}), run({"model": 2 * GOOD}, "wide"))
     assert [(row.name, row.kind) for row in comparison.rows] == [
         ("net", "model"), ("still", "baseline"), ("wide", "model"), ("far", "baseline")
     ]  # fmt: skip
@@ -40,7 +40,7 @@ def test_the_rows_are_the_methods_and_baselines_with_their_errors_the_best_first
 
 
 def test_the_interval_is_about_that_of_a_plain_bootstrap_over_recordings() -> None:
-    best = compared(run({"model": GOOD, "still": BASE})).best
+    best = compare(run({"model": GOOD, "still": BASE})).best
     assert best is not None
     rng = np.random.default_rng(17)
     drawn = []
@@ -52,7 +52,7 @@ def test_the_interval_is_about_that_of_a_plain_bootstrap_over_recordings() -> No
 
 def test_clusters_are_left_out_as_one() -> None:
     clusters = {f"r{place:02d}": "abcd"[place % 4] for place in range(20)}
-    best = compared(run({"model": GOOD, "still": BASE}, clusters=clusters)).best
+    best = compare(run({"model": GOOD, "still": BASE}, clusters=clusters)).best
     assert best is not None and best.n == 4
     parts = [
         math.log(np.delete(GOOD.reshape(5, 4), at, 1).sum() / np.delete(BASE.reshape(5, 4), at, 1).sum())
@@ -64,25 +64,25 @@ def test_clusters_are_left_out_as_one() -> None:
 
 def test_seeds_and_folds_of_a_method_are_one_row_whose_spread_is_over_runs() -> None:
     seeds = [run({"model": GOOD * scale, "still": BASE}, seed=seed) for seed, scale in enumerate((0.9, 1.0, 1.3))]
-    best = compared(*seeds).best
+    best = compare(*seeds).best
     assert best is not None and (best.runs, best.seeds, best.n) == (3, 3, 20)
     means = [GOOD.mean() * scale for scale in (0.9, 1.0, 1.3)]
     assert best.values[0] == pytest.approx(np.mean(means))
     assert best.spread == pytest.approx(np.std(means, ddof=1))
-    single = compared(seeds[1]).best
+    single = compare(seeds[1]).best
     assert single is not None and math.isnan(single.spread)
     assert best.gain.high - best.gain.low > single.gain.high - single.gain.low  # seeds are drawn too
 
 
 def test_a_method_that_shows_an_effect_does_not_compete() -> None:
-    comparison = compared(run({"model": GOOD, "still": BASE}), run({"model": GOOD / 2}, "cheat", control=True))
+    comparison = compare(run({"model": GOOD, "still": BASE}), run({"model": GOOD / 2}, "cheat", control=True))
     assert comparison.best is not None and comparison.best.name == "net"
     assert [row.name for row in comparison.of("control")] == ["cheat"]
 
 
 def test_settings_that_differ_name_a_method_and_are_the_columns_of_a_frame() -> None:
     runs = [run({"model": GOOD * (1 + wide), "still": BASE}, settings={"wide": wide, "deep": 3}) for wide in (0, 1)]
-    comparison = compared(*runs)
+    comparison = compare(*runs)
     assert [row.name for row in comparison.models] == ["net · wide 0", "net · wide 1"]
     frame = comparison.frame()
     assert frame.set_index("name").loc["net · wide 1", "wide"] == 1 and "deep" not in frame

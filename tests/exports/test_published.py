@@ -26,7 +26,7 @@ KEPT = 3  # recordings that are exported
 pytestmark = pytest.mark.data
 
 
-def ingested(lab: Lab, name: str) -> list[str]:
+def ingest(lab: Lab, name: str) -> list[str]:
     """Ingest a set, leave out all recordings but a few, and return the names of these."""
     if not (sample_data() / SETS[name]).exists():
         pytest.skip("published data lie elsewhere; see data/README.md")
@@ -39,7 +39,7 @@ def ingested(lab: Lab, name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", ["xela-psc", pytest.param("xela-flat", marks=pytest.mark.long)])
 def test_a_set_comes_back_from_mcap_to_the_bit(lab: Lab, name: str) -> None:
-    names = ingested(lab, name)
+    names = ingest(lab, name)
     lab.run("export mcap rec -o mcap")
     lab.run("ingest mcap mcap -o back")
     provided, back = tacpipe.open("rec"), tacpipe.open("back")
@@ -49,7 +49,7 @@ def test_a_set_comes_back_from_mcap_to_the_bit(lab: Lab, name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", SETS)
 def test_every_set_is_exported_at_native_rates(lab: Lab, name: str) -> None:
-    names = ingested(lab, name)
+    names = ingest(lab, name)
     provided = tacpipe.open("rec")
     for export in ("csv", "mcap", "hdf5", "card"):
         lab.run(f"export {export} rec -o {export}")
@@ -74,7 +74,7 @@ def test_every_set_is_exported_at_native_rates(lab: Lab, name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", FRAMES)
 def test_every_set_with_a_course_in_time_is_exported_as_frames(lab: Lab, name: str) -> None:
-    names = ingested(lab, name)
+    names = ingest(lab, name)
     lab.run("export lerobot rec -o lr --rate-hz 50 --common")
     lab.run("export zarr rec -o buffer --rate-hz 50 --common")
     lab.run("export hdf5 rec -o demos --structure robomimic --rate-hz 50 --common")

@@ -100,7 +100,7 @@ def test_every_sample_that_was_sent_comes_with_its_stamp_and_the_correction_of_l
     with outlet("force", name) as process:
         began_ns = time.monotonic_ns()
         with closing(opened(name, FORCE)) as link:
-            packets = read_until(link, lambda received: _corrected(received) and len(received) > 100)
+            packets = read_until(link, lambda received: _correct(received) and len(received) > 100)
             sent = stop_outlet(process)
             with pytest.raises(LinkLostError, match="wrist"):
                 while True:
@@ -115,7 +115,7 @@ def test_every_sample_that_was_sent_comes_with_its_stamp_and_the_correction_of_l
     assert len(finite) and np.abs(finite).max() < 0.05
 
 
-def _corrected(packets: list[tuple[int, bytes]]) -> bool:
+def _correct(packets: list[tuple[int, bytes]]) -> bool:
     heads = [lsl.HEAD.unpack_from(data) for _, data in packets if data[:1] == lsl.NUMBERS]
     return any(math.isfinite(correction) for _, correction, _ in heads)
 

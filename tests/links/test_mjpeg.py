@@ -36,7 +36,7 @@ def response(images: list[bytes], *, sized: bool = True, stamped: bool = False) 
 
 
 @contextmanager
-def served(content: bytes) -> Iterator[str]:
+def serve(content: bytes) -> Iterator[str]:
     """Serve ``content`` to one host and close the connection; yield the address."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -77,7 +77,7 @@ def test_any_bytes_are_images_or_a_fault_and_never_an_error(content: bytes) -> N
 
 
 def test_each_image_is_an_entry_with_its_size_and_the_stamp_of_the_server(images: list[bytes]) -> None:
-    with served(response(images, stamped=True)) as address:
+    with serve(response(images, stamped=True)) as address:
         link = open_link(parse(address), Camera(), "gel")
         entries: list[tuple[int, bytes]] = []
         with pytest.raises(LinkLostError, match="the server ended the connection"):
@@ -104,7 +104,7 @@ def test_each_image_is_an_entry_with_its_size_and_the_stamp_of_the_server(images
     ],
 )
 def test_what_is_no_stream_of_images_is_refused_with_the_reason(content: bytes, reason: str) -> None:
-    with served(content) as address, pytest.raises(DeviceError, match=reason):
+    with serve(content) as address, pytest.raises(DeviceError, match=reason):
         open_link(parse(address), Camera(), "gel")
 
 

@@ -47,7 +47,7 @@ def optoforce() -> tuple[Sensor, list[bytes]]:
 
 
 @contextmanager
-def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[bytes]]]:
+def play(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[bytes]]]:
     """A device on a pseudo-terminal, which sends rubbish while its rate of baud is not that of the port."""
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -80,7 +80,7 @@ def played(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[byte
 @pytest.mark.rig
 def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it() -> None:
     steps: list[str] = []
-    with played(*flexitac()) as (path, heard):
+    with play(*flexitac()) as (path, heard):
         report = probing.probe(parse(f"serial:{path}"), progress=steps.append)
 
     first = report.findings[0]
@@ -92,7 +92,7 @@ def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it
 
 @pytest.mark.rig
 def test_a_silent_device_is_asked_as_its_driver_does_and_told_to_stop() -> None:
-    with played(*optoforce()) as (path, heard):
+    with play(*optoforce()) as (path, heard):
         report = probing.probe(parse(f"serial:{path}"))
         time.sleep(0.05)
 
@@ -103,7 +103,7 @@ def test_a_silent_device_is_asked_as_its_driver_does_and_told_to_stop() -> None:
 
 @pytest.mark.rig
 def test_nothing_is_written_to_a_device_that_is_only_listened_to() -> None:
-    with played(*optoforce()) as (path, heard):
+    with play(*optoforce()) as (path, heard):
         report = probing.probe(parse(f"serial:{path}"), passive=True)
 
     assert report.findings == [] and not report.certain
@@ -126,7 +126,7 @@ def test_a_port_that_cannot_be_opened_is_reported_with_its_reason() -> None:
 
 @pytest.mark.rig
 def test_the_command_prints_what_speaks_and_the_lines_for_the_rig_file(lab: Lab) -> None:
-    with played(*flexitac()) as (path, _):
+    with play(*flexitac()) as (path, _):
         output = lab.run(f"sensors probe {path}").out
         listed = json.loads(lab.run(f"sensors probe serial:{path} --json").out)
 

@@ -57,7 +57,7 @@ def test_an_alarm_without_a_level_or_with_values_that_are_not_numbers_is_unknown
     assert states({LOAD: (1.0,) * 3, SLIP: (1.0,)}, [math.nan, 0, 0]) == dict.fromkeys(NAMES, UNKNOWN)
 
 
-def added(truth: Floats, ahead: Floats, slips: Bools | None, shear: Floats | None = None) -> tuple[Loads, SlipAlarms]:
+def add(truth: Floats, ahead: Floats, slips: Bools | None, shear: Floats | None = None) -> tuple[Loads, SlipAlarms]:
     """Return one recording with its loads (time, 3), what a model predicts of them, and its scores for slips (time,)."""
     loads = Loads(LAYOUT, HORIZON, [truth], [np.zeros(len(truth), np.int64)], {MODEL: [ahead]}, [1 / RATE_HZ])
     t_ns = np.arange(len(truth), dtype=np.int64) * round(1e9 / RATE_HZ)
@@ -84,7 +84,7 @@ def false_alarms(beyond: Bools) -> int:
 def test_levels_give_no_more_false_alarms_than_were_allowed_on_what_they_were_set_on(per_hour: float) -> None:
     truth, ahead = steady(0)
     shear = np.abs(ahead - truth).max(axis=1)
-    fitted = alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour)
+    fitted = alarms.set_on(*add(truth, ahead, None, shear), MODEL, per_hour)
     hours = len(truth) / RATE_HZ / 3600
     moved: Bools = np.any(np.abs(ahead - truth) > np.array(fitted.levels[LOAD]), axis=1)
     for beyond in (moved, shear > fitted.levels[SLIP][0]):
@@ -96,9 +96,7 @@ def test_levels_give_no_more_false_alarms_than_were_allowed_on_what_they_were_se
 def test_fewer_allowed_alarms_set_higher_levels() -> None:
     truth, ahead = steady(1)
     shear = np.abs(ahead - truth).max(axis=1)
-    strict, frequent = (
-        alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour) for per_hour in (30.0, 3000.0)
-    )
+    strict, frequent = (alarms.set_on(*add(truth, ahead, None, shear), MODEL, per_hour) for per_hour in (30.0, 3000.0))
     for name in NAMES:
         assert all(low < high for low, high in zip(frequent.levels[name], strict.levels[name], strict=True))
 
@@ -109,14 +107,14 @@ def test_rows_before_a_slip_set_no_level_of_slip() -> None:
     slips = np.zeros(len(truth), dtype=bool)
     slips[5000:5050] = True
     shear[4995:5000] += 1000  # what warns of the slip
-    knowing = alarms.set_on(*added(truth, ahead, slips, shear), MODEL, 1.0)
-    ignorant = alarms.set_on(*added(truth, ahead, None, shear), MODEL, 1.0)
+    knowing = alarms.set_on(*add(truth, ahead, slips, shear), MODEL, 1.0)
+    ignorant = alarms.set_on(*add(truth, ahead, None, shear), MODEL, 1.0)
     assert knowing.levels[SLIP][0] < 100 < ignorant.levels[SLIP][0]
 
 
 def test_levels_are_written_and_read_again_and_an_older_score_for_slips_is_left_out() -> None:
     truth, ahead = steady(3)
-    fitted = alarms.set_on(*added(truth, ahead, None), MODEL, 60)
+    fitted = alarms.set_on(*add(truth, ahead, None), MODEL, 60)
     assert math.isinf(fitted.levels[SLIP][0])  # nothing was predicted of slips
     stored = json.loads(json.dumps(fitted.to_json()))
     assert stored["levels"][SLIP] == [None] and Alarms.from_json(stored) == fitted

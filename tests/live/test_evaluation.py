@@ -22,7 +22,7 @@ from tests.live.sessions import CALIBRATED, TRAINED
 LATENCY_MS, LATE_ROW, CHANGED_ROW = 5.0, 20, 22
 
 
-def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
+def record(recording: Any, predictions: pa.Table) -> FakeRecording:
     """A recording with the streams of a session that published ``predictions``, one of them altered after a late sample."""
     t_ns = predictions["t_ns"].to_numpy()
     columns = {name: predictions[name].to_numpy().copy() for name in predictions.column_names[1:]}
@@ -49,7 +49,7 @@ def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(
         lab.run(command)
     lab.run("predict models/g data/r -o data/p --steps 1,2 --causal --quantiles 10,90")
     model, name = tacpipe.open("models/g"), "trial-000"
-    session = recorded(tacpipe.open("data/r")[name], tacpipe.open("data/p")[name].table())
+    session = record(tacpipe.open("data/r")[name], tacpipe.open("data/p")[name].table())
     recordings: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
     result = evaluation.evaluate(model, recordings)
     live = json.loads(result.files["metrics.json"])["live"]

@@ -35,7 +35,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
-def shown(
+def show(
     chromium: Browser, about: SlipDescription | ForecastDescription, messages: list[Message]
 ) -> WebsocketPublisher:
     """Return a publisher whose page a browser shows, once it has drawn the messages."""
@@ -63,7 +63,7 @@ def test_the_page_draws_the_skins_the_probability_and_the_alarm(chromium: Browse
         SlipMessage(number, number * 20_000_000, number / 10, 0.0, ON if number == 9 else OFF, touch)
         for number in range(1, 10)
     ]
-    publisher = shown(chromium, SLIPS, messages)
+    publisher = show(chromium, SLIPS, messages)
     assert chromium.run("document.getElementById('title').textContent") == "tacpipe live: models/slip"
     assert chromium.run("document.getElementById('answer').textContent") == "0.90"
     assert chromium.run("document.getElementById('state').textContent") == "alarm on"
@@ -78,7 +78,7 @@ def test_the_page_draws_the_skins_the_probability_and_the_alarm(chromium: Browse
 
 def test_the_page_draws_the_skins_and_the_forecast_of_a_session_of_forecasts(chromium: Browser) -> None:
     values = np.array([[3.0, 4.0, 0.0, 0.0], [6.0, 8.0, 0.0, 0.0]], np.float32)  # rms 2.5 and 5
-    publisher = shown(chromium, FORECASTS, [ForecastMessage(1, 20_000_000, values)])
+    publisher = show(chromium, FORECASTS, [ForecastMessage(1, 20_000_000, values)])
     assert chromium.run("ahead.map((row) => row[1])") == [2.5, 5.0]
     assert chromium.run("about.touch") == {"left": [5.0, 0.0]}
     assert chromium.run(PAINTED.format("history", 900, 220)) > 1000

@@ -85,7 +85,7 @@ def served() -> Iterator[tuple[WebsocketPublisher, int]]:
 
 
 @contextlib.contextmanager
-def subscribed(port: int, query: str = "", **options: Any) -> Iterator[Any]:
+def subscribe(port: int, query: str = "", **options: Any) -> Iterator[Any]:
     """Yield a client whose first message has come."""
     from websockets.sync.client import connect
 
@@ -105,7 +105,7 @@ def ended_by_server(connection: socket.socket) -> bool:
 
 def test_a_server_without_a_host_is_reached_from_this_computer_only(served: tuple[WebsocketPublisher, int]) -> None:
     _, port = served
-    with subscribed(port):
+    with subscribe(port):
         pass
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", port))  # every other address of this computer
@@ -115,7 +115,7 @@ def test_connections_beyond_the_limit_are_ended_and_neither_threads_nor_messages
     served: tuple[WebsocketPublisher, int],
 ) -> None:
     publisher, port = served
-    with subscribed(port) as client, contextlib.ExitStack() as opened:
+    with subscribe(port) as client, contextlib.ExitStack() as opened:
         threads = threading.active_count()
         connections = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(100)]
         assert all(ended_by_server(connection) for connection in connections[CONNECTIONS:])
@@ -132,7 +132,7 @@ def test_a_client_that_sends_more_than_a_subscriber_needs_is_ended(
     served: tuple[WebsocketPublisher, int], sent: bytes
 ) -> None:
     publisher, port = served
-    with subscribed(port) as quiet, socket.create_connection(("127.0.0.1", port)) as loud:
+    with subscribe(port) as quiet, socket.create_connection(("127.0.0.1", port)) as loud:
         loud.sendall(HANDSHAKE)
         awaited(lambda: publisher.subscribers == 2)
         with contextlib.suppress(ConnectionError):
@@ -148,16 +148,16 @@ def test_a_web_page_is_refused_unless_the_address_lists_its_origin() -> None:
 
     port = free_port()
     publisher = WebsocketPublisher(f":{port}?origin=http://localhost:3000", ABOUT)
-    with subscribed(port):
+    with subscribe(port):
         pass
     for origin in (
         "http://localhost:3000",
         f"http://127.0.0.1:{port}",
     ):  # the second is that of the publisher's own page
-        with subscribed(port, origin=origin):
+        with subscribe(port, origin=origin):
             pass
     for origin in ("http://evil.example", f"http://evil.example:{port}", "http://127.0.0.1:1", "null"):
-        with pytest.raises(InvalidStatus, match="403"), subscribed(port, origin=origin):
+        with pytest.raises(InvalidStatus, match="403"), subscribe(port, origin=origin):
             pass
     publisher.close()
 
@@ -168,12 +168,12 @@ def test_with_a_token_in_the_environment_only_clients_that_send_it_subscribe(mon
     port = free_port()
     monkeypatch.setenv(TOKEN, "open sesame")
     publisher = WebsocketPublisher(f":{port}", ABOUT)
-    with subscribed(port, "?token=open%20sesame"):
+    with subscribe(port, "?token=open%20sesame"):
         pass
-    with subscribed(port, additional_headers={"Authorization": "Bearer open sesame"}):
+    with subscribe(port, additional_headers={"Authorization": "Bearer open sesame"}):
         pass
     for query, headers in (("", {}), ("?token=", {}), ("?token=sesame", {}), ("", {"Authorization": "Bearer x"})):
-        with pytest.raises(InvalidStatus, match="401"), subscribed(port, query, additional_headers=headers):
+        with pytest.raises(InvalidStatus, match="401"), subscribe(port, query, additional_headers=headers):
             pass
     publisher.close()
 

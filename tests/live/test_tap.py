@@ -26,7 +26,7 @@ def chunk(number: int, size: int = 10) -> Chunks:
     return Chunks.from_pairs([(number, bytes([number % 256]) * size)])
 
 
-def received(theirs: socket.socket, blocks: wire.Blocks) -> list[tuple[str, Chunks | StreamNote]]:
+def receive(theirs: socket.socket, blocks: wire.Blocks) -> list[tuple[str, Chunks | StreamNote]]:
     theirs.setblocking(False)
     blocks_received: list[tuple[str, Chunks | StreamNote]] = []
     while True:
@@ -46,7 +46,7 @@ def test_what_is_put_arrives_in_order_with_its_stream_stamps_and_bytes(pair: Pai
     tap.put("b", chunk(7))
     tap.put("a", StreamNote(8, "a", "lost", "unplugged"))
 
-    begin, first, second = received(pair[1], wire.Blocks(["a", "b"]))
+    begin, first, second = receive(pair[1], wire.Blocks(["a", "b"]))
     assert begin == ("", StreamNote(1, "", wire.BEGIN, "5"))
     assert first[0] == "b" and isinstance(first[1], Chunks)
     assert (first[1].t_ns.tolist(), first[1].data) == ([7], bytes([7]) * 10)
@@ -58,11 +58,11 @@ def test_what_the_socket_does_not_take_waits_and_loses_no_byte(pair: Pair) -> No
     tap.connect(pair[0])
     for number in range(400):  # several times what a socket holds
         tap.put("a", chunk(number, 5000))
-    blocks_received = received(pair[1], blocks)
+    blocks_received = receive(pair[1], blocks)
     assert 0 < len(numbers(blocks_received)) < 400
     while len(numbers(blocks_received)) < 400:
         tap.flush()
-        blocks_received += received(pair[1], blocks)
+        blocks_received += receive(pair[1], blocks)
     assert numbers(blocks_received) == list(range(400)) and tap.overflows == 0
 
 
@@ -72,10 +72,10 @@ def test_a_queue_that_is_full_is_thrown_away_counted_and_reported_to_the_model(p
     for number in range(400):
         tap.put("a", chunk(number, 5000))
     assert tap.overflows > 0 and tap.bytes_lost > 0
-    blocks_received = received(pair[1], blocks)
+    blocks_received = receive(pair[1], blocks)
     for _ in range(100):
         tap.flush()
-        blocks_received += received(pair[1], blocks)
+        blocks_received += receive(pair[1], blocks)
     retained = numbers(blocks_received)
     assert retained == sorted(retained) and retained[-1] == 399 and len(retained) < 400
     overflows = [place for place, (_, block) in enumerate(blocks_received) if isinstance(block, StreamNote)]
@@ -101,7 +101,7 @@ def test_a_process_that_is_started_in_the_middle_gets_the_beginning_of_each_stre
     tap = RecorderTap(["a", "b"])
     tap.connect(pair[0], StreamNote(1, "", wire.BEGIN, "5"))
     tap.put_begins()
-    assert [(name, block.what) for name, block in received(pair[1], wire.Blocks(["a", "b"]))] == [  # type: ignore[union-attr]
+    assert [(name, block.what) for name, block in receive(pair[1], wire.Blocks(["a", "b"]))] == [  # type: ignore[union-attr]
         ("", wire.BEGIN),
         ("a", "began"),
         ("b", "began"),

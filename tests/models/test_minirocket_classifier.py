@@ -24,7 +24,7 @@ def textured(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return x.astype(np.float32), np.array([3, 4, 20])[index]
 
 
-def pressed(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def press(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return slides of noise alone whose pressure on five channels tells the class."""
     rng = np.random.default_rng(seed)
     labels = np.arange(count) % 4
@@ -45,8 +45,8 @@ def test_textures_are_told_apart_where_levels_say_nothing() -> None:
 
 
 def test_strength_counts_where_it_tells_the_class() -> None:
-    x, labels = pressed(80)
-    new, truth = pressed(200, seed=1)
+    x, labels = press(80)
+    new, truth = press(200, seed=1)
     fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
     assert fitted.share == 1
     assert np.mean(fitted.predict(new) == truth) > 0.8

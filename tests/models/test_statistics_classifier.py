@@ -22,7 +22,7 @@ def rippled(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return (x - x.mean(axis=1, keepdims=True) + 50).astype(np.float32), labels
 
 
-def pressed(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def press(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return slides that ripple alike at two levels, and labels 4 and 9."""
     rng = np.random.default_rng(seed)
     labels = np.array([4, 9])[np.arange(count) % 2]
@@ -74,7 +74,7 @@ def test_a_slide_without_its_level_reads_alike_wherever_it_is_pressed() -> None:
     assert np.abs(view_features(lifted, "level") - view_features(x, "level")).max() > 1
 
 
-@pytest.mark.parametrize(("slides", "views"), [(rippled, ("all", "level_removed")), (pressed, ("all", "level"))])
+@pytest.mark.parametrize(("slides", "views"), [(rippled, ("all", "level_removed")), (press, ("all", "level"))])
 def test_what_differs_in_level_or_in_ripple_is_classified_by_the_views_that_hold_it(
     slides: Callable[..., tuple[np.ndarray, np.ndarray]], views: tuple[View, ...]
 ) -> None:
@@ -85,8 +85,8 @@ def test_what_differs_in_level_or_in_ripple_is_classified_by_the_views_that_hold
 
 
 def test_what_differs_in_level_alone_is_not_classified_once_the_level_is_removed() -> None:
-    x, labels = pressed(40)
-    new, truth = pressed(200, seed=1)
+    x, labels = press(40)
+    new, truth = press(200, seed=1)
     assert np.mean(StatisticsClassifier.fit(x, labels, view="level_removed").predict(new) == truth) < 0.65
 
 

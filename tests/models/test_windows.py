@@ -10,7 +10,7 @@ from tacpipe.models.windows import POSE, ForecastWindows, motion, repeats, rotat
 from tests.models.window_fakes import CONTEXT, HORIZON, windows
 
 
-def moved(inputs: ForecastWindows, turn: Rotation, shift: list[float]) -> ForecastWindows:
+def move(inputs: ForecastWindows, turn: Rotation, shift: list[float]) -> ForecastWindows:
     """The windows of the same arm on a base that is turned and shifted as a whole."""
     arm = inputs.arm.double().numpy()
     flat = arm.reshape(-1, arm.shape[-1])
@@ -59,14 +59,14 @@ def test_motion_is_that_of_a_loop_over_rows() -> None:
 
 def test_motion_is_the_same_wherever_the_base_stands_and_heads() -> None:
     inputs = double(windows())
-    moved_inputs = moved(inputs, Rotation.from_euler("z", 1.9), [2.0, -3.0, 0.5])
+    moved_inputs = move(inputs, Rotation.from_euler("z", 1.9), [2.0, -3.0, 0.5])
     for original, turned in zip(motion(inputs), motion(moved_inputs), strict=True):
         assert torch.allclose(original, turned, atol=1e-9)
 
 
 def test_a_base_that_is_tilted_changes_up_and_nothing_else() -> None:
     inputs = double(windows())
-    tilted = moved(inputs, Rotation.from_euler("xyz", [0.7, -0.4, 0.2]), [0.1, 0.2, 0.3])
+    tilted = move(inputs, Rotation.from_euler("xyz", [0.7, -0.4, 0.2]), [0.1, 0.2, 0.3])
     (steps, up), (steps_there, up_there) = motion(inputs), motion(tilted)
     assert torch.allclose(steps, steps_there, atol=1e-9)
     assert not torch.allclose(up, up_there, atol=0.1)

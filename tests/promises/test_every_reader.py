@@ -213,7 +213,7 @@ def _write_twice(write: Callable[[Path], object]) -> Callable[[Path], None]:
     return write_two_folders
 
 
-def _nested(folder: Path) -> None:
+def _nest(folder: Path) -> None:
     xela_files.write_flat(folder / "trial")
     xela_files.write_flat(folder / "trial" / "copy")
 
@@ -257,7 +257,7 @@ NAMED_TWICE: dict[str, list[Case] | str] = {
     ],
     "gelsight-slip": [Case(_write_twice(video_files.write_gelsight), "would both be named lemon-1")],
     "vision2tactile": [Case(_write_twice(grasp_files.write_grasp), "would both be named bleach")],
-    "xela-flat": [Case(_write_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nested, 2)],
+    "xela-flat": [Case(_write_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nest, 2)],
     "xela-psc": [Case(_write_twice(lambda place: xela_files.write_psc(place / "trial")), 2)],
 }
 
@@ -352,7 +352,7 @@ def _database_damaged(folder: Path) -> None:
     (folder / "a" / "a.db3").write_bytes(content)
 
 
-def _changed(write: Callable[[Path], object], name: str, share: float = 0.5, width: int = 40) -> Callable[[Path], None]:
+def _change(write: Callable[[Path], object], name: str, share: float = 0.5, width: int = 40) -> Callable[[Path], None]:
     """Return a function that writes a source and puts other bytes into the middle of one of its files."""
 
     def changed(folder: Path) -> None:
@@ -376,7 +376,7 @@ def _session(folder: Path) -> None:
     session.write(folder / "a.xdf")
 
 
-def _compressed(folder: Path) -> None:
+def _compress(folder: Path) -> None:
     with h5py.File(folder / "a.hdf5", "w") as file:
         values = np.random.default_rng(0).normal(size=4000)
         file.create_dataset("t", data=np.arange(4000.0))
@@ -402,7 +402,7 @@ def _table(kind: str) -> Callable[[Path], None]:
 DAMAGED: dict[str, list[Case] | str] = {
     "lerobot": [
         Case(
-            _changed(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), "episode_000001"
+            _change(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), "episode_000001"
         ),
         Case(_episodes_with({"length": 5}), "holds 12 frames of episode 0, and the folder meta states 5"),
     ],
@@ -418,34 +418,34 @@ DAMAGED: dict[str, list[Case] | str] = {
         Case(_bag_damaged(None), r"its 400 messages from 2023"),
         Case(_database_damaged, "is damaged .*what came after is missing"),
     ],
-    "xdf": [Case(_changed(_session, "a.xdf"), r"bytes .* are not XDF and were left out")],
-    "hdf5": [Case(_changed(_compressed, "a.hdf5", 0.9), "cannot be read")],
+    "xdf": [Case(_change(_session, "a.xdf"), r"bytes .* are not XDF and were left out")],
+    "hdf5": [Case(_change(_compress, "a.hdf5", 0.9), "cannot be read")],
     "zarr": [
         Case(
-            _changed(lambda folder: array_files.replay(folder / "a.zarr"), "data/robot0_eef_pos/1.0", 0.0),
+            _change(lambda folder: array_files.replay(folder / "a.zarr"), "data/robot0_eef_pos/1.0", 0.0),
             "cannot be read",
             RATE,
         )
     ],
     "table": [
-        Case(_changed(_table("csv"), "x.csv"), r"x\.csv", LAYOUT % "csv"),
-        Case(_changed(_table("npz"), "x.npz"), "is not an archive of arrays", LAYOUT % "npz"),
-        Case(_changed(_table("parquet"), "x.parquet"), r"x\.parquet", LAYOUT % "parquet"),
+        Case(_change(_table("csv"), "x.csv"), r"x\.csv", LAYOUT % "csv"),
+        Case(_change(_table("npz"), "x.npz"), "is not an archive of arrays", LAYOUT % "npz"),
+        Case(_change(_table("parquet"), "x.parquet"), r"x\.parquet", LAYOUT % "parquet"),
     ],
-    "biotac-slide": [Case(_changed(slide_files.write_biotac, "*_bio.csv"), "_bio.csv")],
+    "biotac-slide": [Case(_change(slide_files.write_biotac, "*_bio.csv"), "_bio.csv")],
     "roboskin": [
         Case(
-            _changed(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels_*.npy", 0.95),
+            _change(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels_*.npy", 0.95),
             "labels_fold_0.npy",
         )
     ],
     "gelsight-slip": "files of video have no checksums; packets are stored as they lie in the file",
-    "vision2tactile": [Case(_changed(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
+    "vision2tactile": [Case(_change(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
     "xela-flat": [
-        Case(_changed(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+        Case(_change(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
     ],
     "xela-psc": [
-        Case(_changed(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+        Case(_change(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
     ],
 }
 
@@ -458,7 +458,7 @@ def test_of_a_damaged_block_the_loss_is_stated(lab: Lab, reader: str, case: Case
 # ---- A path that leads out of the source
 
 
-def _linked(write: Callable[[Path], object], name: str) -> Callable[[Path], None]:
+def _link(write: Callable[[Path], object], name: str) -> Callable[[Path], None]:
     """Return a function that writes a source and puts a link to a copy elsewhere into the place of a file."""
 
     def linked(folder: Path) -> None:
@@ -510,32 +510,30 @@ LEADS_OUT: dict[str, list[Case] | str] = {
     "lerobot": [
         Case(_path_above, OUT),
         Case(_name_above, OUT),
-        Case(_linked(lambda folder: lerobot_files.write_v2(folder / "set"), "info.json"), OUT),
-        Case(_linked(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), OUT),
+        Case(_link(lambda folder: lerobot_files.write_v2(folder / "set"), "info.json"), OUT),
+        Case(_link(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), OUT),
     ],
-    "mcap": [
-        Case(_linked(lambda folder: writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})]}), "a.mcap"), OUT)
-    ],
+    "mcap": [Case(_link(lambda folder: writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})]}), "a.mcap"), OUT)],
     "rosbag": [
-        Case(_linked(_database_damaged, "a.db3"), OUT),
-        Case(_linked(_database_damaged, "metadata.yaml"), OUT),
+        Case(_link(_database_damaged, "a.db3"), OUT),
+        Case(_link(_database_damaged, "metadata.yaml"), OUT),
         Case(_log_elsewhere, OUT),
     ],
-    "xdf": [Case(_linked(_session, "a.xdf"), OUT)],
-    "hdf5": [Case(_linked(_compressed, "a.hdf5"), OUT), Case(_external_link, "lies in another file")],
+    "xdf": [Case(_link(_session, "a.xdf"), OUT)],
+    "hdf5": [Case(_link(_compress, "a.hdf5"), OUT), Case(_external_link, "lies in another file")],
     "zarr": [
-        Case(_linked(lambda folder: array_files.replay(folder / "a.zarr"), "1.0"), OUT, RATE),
-        Case(_linked(lambda folder: array_files.replay(folder / "a.zarr"), ".zarray"), OUT, RATE),
+        Case(_link(lambda folder: array_files.replay(folder / "a.zarr"), "1.0"), OUT, RATE),
+        Case(_link(lambda folder: array_files.replay(folder / "a.zarr"), ".zarray"), OUT, RATE),
     ],
-    "table": [Case(_linked(_table("csv"), "x.csv"), OUT, LAYOUT % "csv")],
-    "biotac-slide": [Case(_linked(slide_files.write_biotac, "*_bio.csv"), OUT)],
+    "table": [Case(_link(_table("csv"), "x.csv"), OUT, LAYOUT % "csv")],
+    "biotac-slide": [Case(_link(slide_files.write_biotac, "*_bio.csv"), OUT)],
     "roboskin": [
-        Case(_linked(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels*"), OUT)
+        Case(_link(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels*"), OUT)
     ],
-    "gelsight-slip": [Case(_linked(video_files.write_gelsight, "camera_2.avi"), OUT)],
-    "vision2tactile": [Case(_linked(grasp_files.write_grasp, "tactile.tac"), OUT)],
-    "xela-flat": [Case(_linked(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), OUT)],
-    "xela-psc": [Case(_linked(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), OUT)],
+    "gelsight-slip": [Case(_link(video_files.write_gelsight, "camera_2.avi"), OUT)],
+    "vision2tactile": [Case(_link(grasp_files.write_grasp, "tactile.tac"), OUT)],
+    "xela-flat": [Case(_link(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), OUT)],
+    "xela-psc": [Case(_link(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), OUT)],
 }
 
 
@@ -546,7 +544,7 @@ def test_nothing_outside_the_source_is_read(lab: Lab, reader: str, case: Case) -
 
 def test_links_are_followed_where_their_user_allows_it(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TACPIPE_FOLLOW_LINKS", "1")
-    write = _linked(lambda folder: array_files.replay(folder / "a.zarr"), "1.0")
+    write = _link(lambda folder: array_files.replay(folder / "a.zarr"), "1.0")
     ask(lab, "zarr", Case(write, 3, RATE), "a path that leads out")
 
 
@@ -582,7 +580,7 @@ V3 = {
 SHARDS = {"chunk_shape": [80], "codecs": [{"name": "numcodecs.pickle"}], "index_codecs": [{"name": "bytes"}]}
 
 
-def _filtered(folder: Path) -> None:
+def _filter(folder: Path) -> None:
     with h5py.File(folder / "a.hdf5", "w") as file:
         file["demo_0/t_s"] = np.arange(5.0)
         file.create_dataset("demo_0/a", data=np.arange(5.0), chunks=(5,), shuffle=True)
@@ -609,7 +607,7 @@ RUNS_CODE: dict[str, list[Case] | str] = {
         Case(_changed_text("a.bag", b"compression=lz4", b"compression=pkl"), "compressed with pkl, not bz2 or lz4")
     ],
     "xdf": TEXT,
-    "hdf5": [Case(_filtered, "filter 31999, which is not read")],
+    "hdf5": [Case(_filter, "filter 31999, which is not read")],
     "zarr": [
         Case(
             _zarr_array({**V2, "dtype": "|O", "filters": [{"id": "pickle"}]}, pickle.dumps(Runs())),

@@ -113,7 +113,7 @@ class Recorder:
         assert self.process.returncode == code, err
 
 
-def recorded(lab: Lab, stream: str) -> tuple[list[int], dict[str, Any]]:
+def record(lab: Lab, stream: str) -> tuple[list[int], dict[str, Any]]:
     """Return the numbers that a stream of the dataset holds, and its attributes; fails unless each value is the number's."""
     table = pq.read_table(lab.folder / "rec/one" / f"{stream}.parquet")
     numbers = table.column("seq").to_pylist()
@@ -131,7 +131,7 @@ def events(lab: Lab) -> list[dict[str, Any]]:
 def check(lab: Lab, min_count: int) -> None:
     """Fail unless each number from the first to the last is there once, in order, or is reported as lost by the network."""
     for stream in ("wire", "net"):
-        numbers, attributes = recorded(lab, stream)
+        numbers, attributes = record(lab, stream)
         assert len(numbers) >= min_count
         assert all(number < following for number, following in itertools.pairwise(numbers)), "out of order, or twice"
         missing = numbers[-1] - numbers[0] + 1 - len(numbers)
@@ -172,7 +172,7 @@ def test_a_recorder_that_was_killed_leaves_every_number_up_to_then(lab: Lab, dev
     lab.run("acquire --recover")
 
     check(lab, min_count=100)
-    _, attributes = recorded(lab, "wire")
+    _, attributes = record(lab, "wire")
     assert (attributes["ended"], attributes["requested_duration_s"]) == ("recovered", 1000.0)
     assert [event["cause"] for event in events(lab) if not event["stream"]] == ["recovered"]
 
@@ -183,4 +183,4 @@ def test_a_recorder_whose_terminal_was_closed_has_every_number_up_to_then(lab: L
     recorder.ends(signal.SIGHUP)
 
     check(lab, min_count=150)
-    assert recorded(lab, "wire")[1]["ended"] == "interrupted"
+    assert record(lab, "wire")[1]["ended"] == "interrupted"

@@ -21,7 +21,7 @@ from tests.recording.test_schedule import FORCE, RATE_HZ, counts
 from tests.test_garbage import age
 
 
-def described(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:
+def describe(lab: Lab) -> tuple[Any, Any, list[tuple[str, str]]]:
     """Return how the only recording ended, what was asked for, and the events of it as a whole."""
     shard = live.only(lab.folder)
     rows = shard.table("events").to_pylist() if "events" in shard.streams else []
@@ -44,7 +44,7 @@ def after_crash(lab: Lab) -> None:
 def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script: Script) -> None:
     lab.run("acquire rig.toml -o rec --duration-s 3 --name one")
 
-    assert described(lab) == ("completed", 3.0, [])
+    assert describe(lab) == ("completed", 3.0, [])
     assert "not completed" not in lab.run("show rec").out
 
 
@@ -71,7 +71,7 @@ def test_a_recording_that_a_signal_cut_short_is_interrupted(
     lasts_s = (counts(live.only(lab.folder))[-1] - counts(live.only(lab.folder))[0]) / RATE_HZ
 
     events = [] if expected_end == "completed" else [("interrupted", f"{lasts_s:.1f} s are there; {request_text}")]
-    assert described(lab) == (expected_end, requested, events)
+    assert describe(lab) == (expected_end, requested, events)
     show_text = lab.run("show rec").out
     assert f"ended: {expected_end} (1)" in show_text
     of_requested = " of 10" if requested else ""
@@ -87,7 +87,7 @@ def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, scrip
     lasts_s = (len(counts(live.only(lab.folder))) - 1) / RATE_HZ
 
     assert 4.8 < lasts_s < 5
-    assert described(lab) == ("recovered", 10.0, [("recovered", f"{lasts_s:.1f} s are there; 10 s were requested")])
+    assert describe(lab) == ("recovered", 10.0, [("recovered", f"{lasts_s:.1f} s are there; 10 s were requested")])
     line = f"not completed: one: recovered after a crash or a power failure, {lasts_s:.1f} of 10 s"
     assert line in lab.run("show rec").out.splitlines()
 
@@ -103,13 +103,13 @@ def test_a_recording_that_ended_and_was_sealed_by_another_process_is_whole_and_s
         assert lab.call("acquire rig.toml -o rec --duration-s 3 --name one").code == 1
     lab.run("acquire --recover")
 
-    assert described(lab) == ("completed", 3.0, [])
+    assert describe(lab) == ("completed", 3.0, [])
 
 
 def test_what_a_label_says_of_the_end_of_a_recording_counts_for_nothing(lab: Lab, script: Script) -> None:
     lab.run("acquire rig.toml -o rec --duration-s 3 --name one --label ended=never")
 
-    assert described(lab)[0] == "completed"
+    assert describe(lab)[0] == "completed"
 
 
 def test_a_spool_of_before_is_recovered_without_a_word_on_its_duration(lab: Lab) -> None:
@@ -117,7 +117,7 @@ def test_a_spool_of_before_is_recovered_without_a_word_on_its_duration(lab: Lab)
 
     assert not {"duration_s", "keep"} & set(Spooled(folder).header)
     lab.run("acquire --recover")
-    assert described(lab) == ("recovered", None, [("recovered", "0.1 s are there; no duration was requested")])
+    assert describe(lab) == ("recovered", None, [("recovered", "0.1 s are there; no duration was requested")])
 
 
 @pytest.mark.parametrize("duration_s", ["3", float("inf"), [3]])

@@ -33,7 +33,7 @@ def read(parts: list[tuple[int, bytes]], reading: LinkReader | None = None) -> t
     return [reading.feed(chunks(parts)), reading.finish()], reading
 
 
-def described(batches: list[Batch]) -> list[tuple[str, int, int]]:
+def describe(batches: list[Batch]) -> list[tuple[str, int, int]]:
     return [(event.cause, event.frames, event.bytes) for batch in batches for event in batch.events]
 
 
@@ -43,14 +43,14 @@ def test_samples_hold_arrival_counter_and_values() -> None:
 
     assert batches[0].t_ns.tolist() == [row * PERIOD_NS for row in range(100)]
     assert batches[0].seq is not None and batches[0].seq.tolist() == list(range(65_500, 65_600))  # over the wrap
-    assert described(batches) == [] and reading.lost == 0
+    assert describe(batches) == [] and reading.lost == 0
 
 
 def test_frames_that_never_came_are_lost_on_the_link() -> None:
     sent = list(enumerate(frames(100)))
     batches, reading = read(sent[:40] + sent[47:])
 
-    assert described(batches) == [("link", 7, 0)] and reading.lost == 7
+    assert describe(batches) == [("link", 7, 0)] and reading.lost == 7
 
 
 def test_a_garbled_frame_is_counted_once_though_bytes_and_counter_both_tell() -> None:
@@ -59,7 +59,7 @@ def test_a_garbled_frame_is_counted_once_though_bytes_and_counter_both_tell() ->
     sent[50] = (row, frame[:9] + bytes([frame[9] ^ 1]) + frame[10:])
     batches, reading = read(sent)
 
-    assert described(batches) == [(framing.GARBLED, 1, 16)] and reading.lost == 1
+    assert describe(batches) == [(framing.GARBLED, 1, 16)] and reading.lost == 1
 
 
 def test_noise_between_whole_frames_costs_none() -> None:
@@ -67,7 +67,7 @@ def test_noise_between_whole_frames_costs_none() -> None:
     sent.insert(30, (30, b"\x01" * 50))
     batches, reading = read(sent)
 
-    assert reading.lost == 0 and sum(size for _, _, size in described(batches)) == 50
+    assert reading.lost == 0 and sum(size for _, _, size in describe(batches)) == 50
     assert sum(len(batch) for batch in batches) == 100
 
 
@@ -75,7 +75,7 @@ def test_a_packet_that_comes_twice_is_one_sample() -> None:
     sent = list(enumerate(frames(20)))
     batches, reading = read([*sent[:10], sent[9], *sent[10:]])
 
-    assert described(batches) == [("duplicate", 0, 0)] and reading.lost == 0
+    assert describe(batches) == [("duplicate", 0, 0)] and reading.lost == 0
     assert batches[0].seq is not None and batches[0].seq.tolist() == list(range(20))
 
 
@@ -84,7 +84,7 @@ def test_a_sample_that_comes_late_is_not_lost() -> None:
     order = [*range(10), 11, 10, *range(12, 20)]
     batches, reading = read([(place, sent[row]) for place, row in enumerate(order)])
 
-    assert described(batches) == [("link", 1, 0), ("late", -1, 0)] and reading.lost == 0
+    assert describe(batches) == [("link", 1, 0), ("late", -1, 0)] and reading.lost == 0
     assert batches[0].seq is not None and batches[0].seq.tolist() == order
 
 
@@ -95,7 +95,7 @@ def test_a_link_that_was_lost_costs_what_the_counter_says() -> None:
     broken = reading.end_link()
     after = reading.feed(chunks([(row, sent[row]) for row in range(1400, 2000)]))
 
-    assert described([broken, after]) == [("link", 900, 0)]
+    assert describe([broken, after]) == [("link", 900, 0)]
     assert reading.account.received == reading.account.framed == 1100 * 16
 
 
@@ -104,7 +104,7 @@ def test_a_device_that_restarts_is_told_from_one_that_lost_much() -> None:
     reading.feed(chunks(list(enumerate(frames(500, first=30_000)))))
     after = reading.feed(chunks([(row + 1500, frame) for row, frame in enumerate(frames(10))]))
 
-    assert next(cause for cause, _, _ in described([after])) == "counter_reset"
+    assert next(cause for cause, _, _ in describe([after])) == "counter_reset"
     assert after.seq is not None and np.diff(after.seq).tolist() == [1] * 9 and after.seq[0] > 30_499
 
 
@@ -115,7 +115,7 @@ def test_an_outage_longer_than_the_counter_is_counted_by_the_clock() -> None:
         chunks([(100_000 + row, frame) for row, frame in enumerate(frames(10, first=100_000 % 65_536))])
     )
 
-    assert described([late]) == [("link", 99_990, 0)]
+    assert describe([late]) == [("link", 99_990, 0)]
 
 
 @given(st.lists(st.integers(1, 700), min_size=1, max_size=6), st.sets(st.integers(1, 98), max_size=20))

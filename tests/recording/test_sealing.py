@@ -21,7 +21,7 @@ RIG = '[[stream]]\nname = "robot"\nsensor = "franka"\ntransport = "tcp+udp:172.1
 BLOCK = 1000
 
 
-def recorded(store: Store, seconds: int, output: str = "rec") -> Spooled:
+def record(store: Store, seconds: int, output: str = "rec") -> Spooled:
     """Return the spool of an arm that sent a state every millisecond."""
     sensor = rig_of.parse(RIG).streams["robot"].sensor
     spool = Spool(store.root, {"output": output, "recording": "r", "attributes": {}, "rig": RIG}, ["robot"])
@@ -50,14 +50,14 @@ def sealed_alone(folder: Path, seconds: int) -> int:
     """Return the peak of resident memory, in bytes, of a process that seals a spool."""
     store = Store(folder / ".tacpipe")
     store.prepare()
-    recorded(store, seconds, str(folder / "rec"))
+    record(store, seconds, str(folder / "rec"))
     return peaks.bytes_of(folder, "acquire --recover")
 
 
 def test_a_sealed_stream_has_the_bytes_of_its_table(tmp_path: Path) -> None:
     store = Store(tmp_path / ".tacpipe")
     store.prepare()
-    read, rig = recorded(store, 3), rig_of.parse(RIG)
+    read, rig = record(store, 3), rig_of.parse(RIG)
     sealed = sealing.seal(read, rig)
     with store.at_work():
         appending.append(store, tmp_path / "rec", read, rig, sealed)

@@ -48,7 +48,7 @@ def silent() -> Iterator[str]:
     os.close(slave)
 
 
-def refused(lab: Lab, *streams: str) -> list[str]:
+def refuse(lab: Lab, *streams: str) -> list[str]:
     """Return the sentences of a recording that does not begin, one a stream; fails if anything was written."""
     (lab.folder / "rig.toml").write_text("".join(streams))
     ran = lab.call("acquire rig.toml -o rec --duration-s 1")
@@ -65,7 +65,7 @@ def place(served: Emulator, name: str) -> str:
 
 
 def test_a_port_that_is_not_there_is_named_with_those_that_are(lab: Lab) -> None:
-    (message,) = refused(lab, live.stream("force", "optoforce", "serial:/dev/gone"))
+    (message,) = refuse(lab, live.stream("force", "optoforce", "serial:/dev/gone"))
 
     assert re.fullmatch(
         r"Stream force \(serial:/dev/gone\): there is no port /dev/gone; there (is|are) .+\. "
@@ -82,7 +82,7 @@ def test_a_port_that_another_program_holds_is_told_with_that_program(lab: Lab, s
     with subprocess.Popen([sys.executable, "-c", program, silent], **pipes) as holder:
         assert holder.stdout is not None and holder.stdin is not None
         holder.stdout.readline()
-        (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+        (message,) = refuse(lab, live.stream("force", "optoforce", f"serial:{silent}"))
         holder.stdin.close()
 
     about = re.escape(f"Stream force (serial:{silent}): {silent} is used by ")
@@ -102,7 +102,7 @@ def test_a_port_that_is_forbidden_is_told_with_the_group_that_may(
         return real(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "open", forbidden)
-    (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+    (message,) = refuse(lab, live.stream("force", "optoforce", f"serial:{silent}"))
 
     group = r"it belongs to the group \w+: run `sudo usermod -aG \w+ \$USER`, then log in again\."
     about = re.escape(f"Stream force (serial:{silent}): you may not open {silent}; ")
@@ -110,7 +110,7 @@ def test_a_port_that_is_forbidden_is_told_with_the_group_that_may(
 
 
 def test_a_silent_port_is_told_with_its_rate(lab: Lab, silent: str) -> None:
-    (message,) = refused(lab, live.stream("force", "optoforce", f"serial:{silent}"))
+    (message,) = refuse(lab, live.stream("force", "optoforce", f"serial:{silent}"))
 
     assert message == (
         f"Stream force (serial:{silent}): a frame of optoforce was awaited for 1 s, but nothing was received. Check power "
@@ -120,7 +120,7 @@ def test_a_silent_port_is_told_with_its_rate(lab: Lab, silent: str) -> None:
 
 
 def test_a_device_that_does_not_answer_at_all_is_told_with_what_was_awaited(lab: Lab, silent: str) -> None:
-    (message,) = refused(lab, live.stream("range", "tfmini", f"serial:{silent}"))
+    (message,) = refuse(lab, live.stream("range", "tfmini", f"serial:{silent}"))
 
     assert message.startswith(
         f"Stream range (serial:{silent}): the reply to command 0x05 was awaited for 2 s, but nothing was received."
@@ -130,7 +130,7 @@ def test_a_device_that_does_not_answer_at_all_is_told_with_what_was_awaited(lab:
 @pytest.mark.parametrize("baud", [9600, 57600, 460800])
 def test_a_port_at_another_rate_is_told_as_a_possibility(lab: Lab, served: Emulator, baud: int) -> None:
     at = place(served, "range")
-    (message,) = refused(lab, live.stream("range", "tfmini", at, f"{{ baud = {baud} }}"))
+    (message,) = refuse(lab, live.stream("range", "tfmini", at, f"{{ baud = {baud} }}"))
 
     assert re.fullmatch(
         re.escape(f"Stream range ({at}): the reply to command 0x05 was awaited for 2 s, but ")
@@ -143,7 +143,7 @@ def test_a_port_at_another_rate_is_told_as_a_possibility(lab: Lab, served: Emula
 
 def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
     at = place(served, "range")
-    (message,) = refused(lab, live.stream("force", "optoforce", at, "{ baud = 115200 }"))
+    (message,) = refuse(lab, live.stream("force", "optoforce", at, "{ baud = 115200 }"))
 
     assert re.fullmatch(
         re.escape(f"Stream force ({at}): a frame of optoforce was awaited for 3 s, but ")
@@ -154,13 +154,13 @@ def test_another_sensor_is_named(lab: Lab, served: Emulator) -> None:
 
 
 def test_another_sensor_than_the_one_that_should_answer_is_named(lab: Lab, served: Emulator) -> None:
-    (message,) = refused(lab, live.stream("pad", "paxini", place(served, "range"), "{ baud = 115200 }"))
+    (message,) = refuse(lab, live.stream("pad", "paxini", place(served, "range"), "{ baud = 115200 }"))
 
     assert "They are frames of tfmini: set that sensor in the rig file" in message
 
 
 def test_a_sensor_that_sends_and_does_not_answer_is_told_from_another_one(lab: Lab, served: Emulator) -> None:
-    (message,) = refused(lab, live.stream("range", "tfmini", place(served, "plain")))
+    (message,) = refuse(lab, live.stream("range", "tfmini", place(served, "plain")))
 
     assert message.endswith(
         "bytes received contain none. They are frames of tfmini, so the device does not receive our requests or is another "
@@ -178,7 +178,7 @@ def test_a_sensor_that_sends_and_does_not_answer_is_told_from_another_one(lab: L
 def test_the_option_that_is_wrong_is_named(
     lab: Lab, served: Emulator, stream: str, sensor: str, options: str, expected_options: str
 ) -> None:
-    (message,) = refused(lab, live.stream("load", sensor, place(served, stream), options))
+    (message,) = refuse(lab, live.stream("load", sensor, place(served, stream), options))
 
     assert message.endswith(f"They are frames of {expected_options}: set these options in the rig file.")
 
@@ -186,7 +186,7 @@ def test_the_option_that_is_wrong_is_named(
 def test_a_port_that_nobody_serves_is_told(lab: Lab) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    (skin, robot) = refused(
+    (skin, robot) = refuse(
         lab,
         live.stream("skin", "xela", f"ws:127.0.0.1:{port}"),
         live.stream("robot", "ur-rtde", f"tcp:127.0.0.1:{port}"),
@@ -201,7 +201,7 @@ def test_a_box_that_refuses_datagrams_is_told(lab: Lab) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    (message,) = refused(lab, live.stream("wrench", "ati-netft", f"udp:127.0.0.1:{port}"))
+    (message,) = refuse(lab, live.stream("wrench", "ati-netft", f"udp:127.0.0.1:{port}"))
 
     assert message == (
         f"Stream wrench (udp:127.0.0.1:{port}) is lost: the host refuses the port. Check the port, and that the "
@@ -213,7 +213,7 @@ def test_a_box_that_sends_no_datagram_is_told(lab: Lab) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
         box.bind(("127.0.0.1", 0))
         at = f"udp:127.0.0.1:{box.getsockname()[1]}"
-        (message,) = refused(lab, live.stream("wrench", "ati-netft", at))
+        (message,) = refuse(lab, live.stream("wrench", "ati-netft", at))
 
     assert message == (
         f"Stream wrench ({at}): a frame of ati-netft was awaited for 1 s, but nothing was received. Check power and "
@@ -222,7 +222,7 @@ def test_a_box_that_sends_no_datagram_is_told(lab: Lab) -> None:
 
 
 def test_every_stream_that_is_wrong_has_a_sentence(lab: Lab, served: Emulator, tmp_path: Path) -> None:
-    messages = refused(
+    messages = refuse(
         lab,
         live.stream("one", "optoforce", "serial:/dev/gone"),
         live.stream("good", "tfmini", place(served, "range")),

@@ -75,7 +75,7 @@ class Device:
 RIG = rig_of.parse(live.stream("force", "optoforce", "serial:/dev/none", "{ axes = 3, rate_hz = 1000 }"))
 
 
-def recorded(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
+def record(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
     """Return the stream as it is sealed that a device sent."""
     ((name, stream),) = rig.streams.items()
     device.station = reader = Station(stream)
@@ -96,7 +96,7 @@ def stalls(sealed: Sealed) -> list[tuple[int, str]]:
 
 
 def test_a_recorder_that_is_never_held_up_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sealed = recorded(tmp_path, Device(monkeypatch, frames(5000), {1000: 80, 2000: 60}))  # ordinary delays
+    sealed = record(tmp_path, Device(monkeypatch, frames(5000), {1000: 80, 2000: 60}))  # ordinary delays
 
     assert not sealed.events and not sealed.uncertain
     assert sealing.UNCERTAIN not in sealed.table.column_names
@@ -111,7 +111,7 @@ def test_a_link_is_drained_when_a_read_found_nothing_waiting(tmp_path: Path, mon
         return chunks
 
     device.read = noted  # type: ignore[method-assign]
-    recorded(tmp_path, device)
+    record(tmp_path, device)
     full_reads = [drained for count, drained in reads if count == 500]
     assert len(full_reads) == 4 and not any(full_reads)  # each is the state after the read before it
     assert [drained for _, drained in reads][-1]
@@ -121,7 +121,7 @@ def test_a_link_is_drained_when_a_read_found_nothing_waiting(tmp_path: Path, mon
 def test_what_waited_while_the_recorder_was_stopped_has_an_uncertain_arrival(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasts_ms: int
 ) -> None:
-    sealed = recorded(tmp_path, Device(monkeypatch, frames(8000), {1000: lasts_ms}))
+    sealed = record(tmp_path, Device(monkeypatch, frames(8000), {1000: lasts_ms}))
     table = sealed.table
     t_ns, uncertain_ns = (table.column(name).to_numpy() for name in ("t_ns", sealing.UNCERTAIN))
     sent_ns = START_NS + (table.column("seq").to_numpy() + 1) * MS
@@ -140,7 +140,7 @@ def test_stamps_of_the_kernel_are_right_however_late_they_are_read(
 ) -> None:
     device = Device(monkeypatch, frames(5000), {1000: 2000})
     device.kernel_stamped = True
-    sealed = recorded(tmp_path, device)
+    sealed = record(tmp_path, device)
 
     assert len(stalls(sealed)) == 1 and not sealed.uncertain
 
@@ -148,7 +148,7 @@ def test_stamps_of_the_kernel_are_right_however_late_they_are_read(
 def test_time_in_which_the_computer_was_suspended_is_in_the_stamps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sealed = recorded(tmp_path, Device(monkeypatch, frames(4000), {1000: 3_600_000}, asleep=True))
+    sealed = record(tmp_path, Device(monkeypatch, frames(4000), {1000: 3_600_000}, asleep=True))
     steps_ns = np.diff(sealed.table.column("t_ns").to_numpy())
 
     ((_, detail),) = stalls(sealed)
@@ -186,7 +186,7 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
     sent = made.pieces(sensor, sensor.encode(samples))
     # the fastest arrivals are those of a recorder that was starved all through the second half, but for moments
     device = Device(monkeypatch, sent, dict.fromkeys(range(1000, 8600, 310), 300))
-    table = recorded(tmp_path, device, rig).table
+    table = record(tmp_path, device, rig).table
 
     class Recording:
         name, attributes, streams = "r", {"master": "pad"}, ("pad",)

@@ -34,7 +34,7 @@ def files_outside_store(lab: Lab) -> set[Path]:
     return project | set(lab.folder.parent.iterdir())
 
 
-def refused(lab: Lab, folder: Path) -> str:
+def refuse(lab: Lab, folder: Path) -> str:
     """Return why a spool is not sealed; fails if it is, if anything was written for it, or if it says more than a line."""
     before, files = files_outside_store(lab), sorted(folder.iterdir())
     ran = lab.call("acquire --recover")
@@ -56,7 +56,7 @@ def test_a_header_that_names_a_dataset_elsewhere_is_refused(lab: Lab, tmp_path_f
     folder = spooled(lab)
     declare(folder, output=output.format(outside=outside, project=lab.folder) if isinstance(output, str) else output)
 
-    assert "which is neither the -o of this command nor in the project of its store" in refused(lab, folder)
+    assert "which is neither the -o of this command nor in the project of its store" in refuse(lab, folder)
     assert not list(outside.iterdir())
 
 
@@ -67,7 +67,7 @@ def test_a_header_that_names_no_recording_is_refused(lab: Lab, name: Any) -> Non
     folder = spooled(lab)
     declare(folder, recording=name)
 
-    assert refused(lab, folder).startswith("Its recording is named ")
+    assert refuse(lab, folder).startswith("Its recording is named ")
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_header_that_makes_no_sense_is_refused_with_what_is_wrong(lab: Lab, va
     folder = spooled(lab)
     declare(folder, **values)
 
-    assert refused(lab, folder).startswith(why)
+    assert refuse(lab, folder).startswith(why)
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_file_of_another_user_in_ones_own_spool_is_refused(lab: Lab, name: str
     folder = spooled(lab)
     os.chown(folder / name, 12345, -1)
 
-    assert f"{folder / name} belongs to another user (12345). Only this user can seal it." in refused(lab, folder)
+    assert f"{folder / name} belongs to another user (12345). Only this user can seal it." in refuse(lab, folder)
 
 
 def test_others_cannot_open_a_spool(lab: Lab) -> None:

@@ -47,7 +47,7 @@ def pad(touched: int | None = None) -> Watch:
     return watch
 
 
-def rendered(view: RigView, watches: dict[str, Watch], *, colours: bool = False) -> str:
+def render(view: RigView, watches: dict[str, Watch], *, colours: bool = False) -> str:
     """Return what the view draws on a terminal."""
     console = Console(file=io.StringIO(), width=100, force_terminal=colours, color_system="256" if colours else None)
     figures = {name: watch.figures(clock.now_ns()) for name, watch in watches.items()}
@@ -85,7 +85,7 @@ def test_lines_come_now_and_then_and_not_at_all_if_asked(
 
 def test_the_table_tells_every_stream_and_marks_the_ones_that_lose(force: Watch) -> None:
     watches = {"force": force, "pad": pad()}
-    text = rendered(RigView(watches), watches)
+    text = render(RigView(watches), watches)
 
     assert "recording one, 3 s" in text
     (row,) = [line for line in text.splitlines() if line.startswith("│ force")]
@@ -98,14 +98,14 @@ def test_the_table_tells_every_stream_and_marks_the_ones_that_lose(force: Watch)
         "7",
         "0",
     ]
-    coloured = rendered(RigView(watches), watches, colours=True)
+    coloured = render(RigView(watches), watches, colours=True)
     assert re.search(r"\x1b\[31m *force", coloured) and not re.search(r"\x1b\[31m *pad", coloured)
 
 
 def test_the_map_shows_the_taxel_that_is_pressed(force: Watch) -> None:
     for touched in (0, 5, TAXELS - 1):
         watches = {"pad": pad(touched)}
-        text = rendered(RigView(watches), watches, colours=True)
+        text = render(RigView(watches), watches, colours=True)
         cells = re.findall(r"\x1b\[(4[0-7]|48;5;\d+)m((?:  )+)\x1b\[0m", text)
         colours = [colour for colour, blanks in cells for _ in range(len(blanks) // 2)]
 
@@ -117,7 +117,7 @@ def test_the_map_shows_the_taxel_that_is_pressed(force: Watch) -> None:
 
 def test_a_map_has_rows_of_sixteen(force: Watch) -> None:
     watches = {"pad": pad(3)}
-    lines = rendered(RigView(watches), watches).splitlines()
+    lines = render(RigView(watches), watches).splitlines()
     start = next(number for number, line in enumerate(lines) if line.strip() == "pad")
 
     assert [len(line) for line in lines[start + 1 :]] == [2 * 16, 2 * (TAXELS - 16)]

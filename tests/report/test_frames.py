@@ -31,7 +31,7 @@ def dataset(tables: dict[str, pa.Table], names: str) -> Any:
     return SimpleNamespace(recordings={name: FakeRecording(tables, name=name) for name in names})
 
 
-def shown(fold: Any) -> dict[str, list[str]]:
+def show(fold: Any) -> dict[str, list[str]]:
     """Return the texts of the pictures by title."""
     return {
         block.title: [picture.text for picture in block.pictures]
@@ -48,7 +48,7 @@ def test_right_and_wrong_predictions_have_frames_with_the_label(path: Path) -> N
         Outcome("x", "cup", "cup", True),
     ]
     (fold,) = frame_folds(outcomes, [cameras])
-    assert shown(fold) == {"Right": ["cup"], "Wrong": ["box, and it is cup"]}
+    assert show(fold) == {"Right": ["cup"], "Wrong": ["box, and it is cup"]}
     assert fold.about == "1 of 2 are right"
 
 
@@ -67,7 +67,7 @@ def test_at_most_a_few_of_many_predictions_are_shown(path: Path) -> None:
     names = "abcdefgh"
     cameras = dataset({"gel": frames_of(path)}, names)
     (fold,) = frame_folds([Outcome(name, name, name, True) for name in names], [cameras])
-    assert len(shown(fold)["Right"]) == SHOWN
+    assert len(show(fold)["Right"]) == SHOWN
 
 
 def test_without_cameras_there_is_no_fold() -> None:

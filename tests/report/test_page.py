@@ -152,7 +152,7 @@ def weighing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget()
 
 
-def weighed(name: str, off: float, seed: int = 0) -> Any:
+def weigh(name: str, off: float, seed: int = 0) -> Any:
     weights = [f"w{place}" for place in range(9)]
     model = {thing: off + 0.01 * place for place, thing in enumerate(weights)}
     errors = {"model": model, "mean_weight": dict.fromkeys(weights, 1.0)}
@@ -165,11 +165,11 @@ def weighed(name: str, off: float, seed: int = 0) -> Any:
 
 @pytest.mark.usefixtures("weighing")
 def test_a_third_partys_task_gets_the_same_page_by_its_specification() -> None:
-    content = page.render([weighed("scale", 0.54), weighed("scale", 0.56, seed=1), weighed("spring", 1.5)])
+    content = page.render([weigh("scale", 0.54), weigh("scale", 0.56, seed=1), weigh("spring", 1.5)])
     text = check(content)
     assert "Weights of things" in text and "light things" in text and "mean weight" in text
     assert '<p class="answer better">' in content.decode() and "tacpipe view DATASET w8" in content.decode()
-    (compared,) = engine.compare([weighed("scale", 0.54), weighed("scale", 0.56, seed=1), weighed("spring", 1.5)])
+    (compared,) = engine.compare([weigh("scale", 0.54), weigh("scale", 0.56, seed=1), weigh("spring", 1.5)])
     assert [(compared_method.name, compared_method.runs) for compared_method in compared.models] == [
         ("scale", 2),
         ("spring", 1),

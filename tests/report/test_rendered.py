@@ -86,7 +86,7 @@ def touch_many() -> list[Any]:
     return [touch_fakes.result(), touch_fakes.result(seed=1), touch_fakes.result("trees", off=0.02), *heads, *inputs]
 
 
-def mixed() -> list[Any]:
+def mix() -> list[Any]:
     return [*forward_single(), *material_single(), *touch_single(), unknown_result("graph")]
 
 
@@ -101,12 +101,12 @@ PAGES: dict[str, Callable[[], list[Any]]] = {
         material_many,
         touch_single,
         touch_many,
-        mixed,
+        mix,
     )
 }
 
 
-def inspected(chromium: Browser, content: bytes, width: int, *, dark: bool) -> list[str]:
+def inspect_page(chromium: Browser, content: bytes, width: int, *, dark: bool) -> list[str]:
     """Return the problems of a page as it opens, and again with all folds open."""
     chromium.dark(dark)
     chromium.show(content, width)
@@ -116,8 +116,8 @@ def inspected(chromium: Browser, content: bytes, width: int, *, dark: bool) -> l
 
 
 def test_a_page_of_all_tasks_is_whole_as_a_reader_sees_it(chromium: Browser) -> None:
-    content = page.render(mixed(), title="")
-    assert inspected(chromium, content, 400, dark=False) == []
+    content = page.render(mix(), title="")
+    assert inspect_page(chromium, content, 400, dark=False) == []
     assert (
         chromium.run("document.querySelectorAll('section')[0].querySelector('table').getBoundingClientRect().top") > 0
     )
@@ -129,7 +129,7 @@ def test_pages_are_whole_at_both_widths_light_and_dark(chromium: Browser, name: 
     content = page.render(PAGES[name](), title="")
     for width in WIDTHS:
         for dark in (False, True):
-            assert inspected(chromium, content, width, dark=dark) == [], (width, dark)
+            assert inspect_page(chromium, content, width, dark=dark) == [], (width, dark)
 
 
 @pytest.mark.long

@@ -45,10 +45,10 @@ def harms(sensor: Sensor, pieces: Sequence[bytes], rng: np.random.Generator) -> 
         row, fault = start + int(rng.integers(JITTER)), FAULTS[number % len(FAULTS)]
         sound = packets(sensor, pieces[row])
         place = int(rng.integers(len(sound)))
-        yield Harm(row, fault, [*sound[:place], *_harmed(sound[place], fault, rng), *sound[place + 1 :]])
+        yield Harm(row, fault, [*sound[:place], *_harm(sound[place], fault, rng), *sound[place + 1 :]])
 
 
-def _harmed(packet: bytes, fault: str, rng: np.random.Generator) -> list[bytes]:
+def _harm(packet: bytes, fault: str, rng: np.random.Generator) -> list[bytes]:
     """Return what comes instead of a packet."""
     if fault == LOST:
         return []

@@ -22,7 +22,7 @@ def samples(kind: str, sensor: Sensor, count: int, seed: int = 0) -> Samples:
     fields = sensor.fields()
     limits = LIMITS.get(kind, {})
     columns = {field.name: _column(field, count, rng, limits) for field in fields}
-    _turned(columns)
+    _turn(columns)
     if kind in CONSTRAINED:
         columns = CONSTRAINED[kind](columns, sensor)
     period_ns = round(1e9 / (sensor.rate_hz or 100.0))
@@ -30,9 +30,9 @@ def samples(kind: str, sensor: Sensor, count: int, seed: int = 0) -> Samples:
     t_device_ns = np.arange(count) * period_ns // tick_ns % modulus * tick_ns
     return Samples(
         blocks(kind, sensor, columns),
-        seq=_counted(sensor.counter, sensor.step, count),
+        seq=_count(sensor.counter, sensor.step, count),
         t_device_ns=t_device_ns.astype(np.int64),
-        device_seq=_counted(sensor.device_counter, 1, count),
+        device_seq=_count(sensor.device_counter, 1, count),
         rows=np.arange(count),
     )
 
@@ -153,7 +153,7 @@ def _text(value: str | bytes) -> str:
     return value.decode("latin-1") if isinstance(value, bytes) else value
 
 
-def _counted(modulus: int | None, step: int, count: int) -> Int64s | None:
+def _count(modulus: int | None, step: int, count: int) -> Int64s | None:
     """Return a counter that goes round once within the samples, where that is not too far off."""
     if modulus is None:
         return None
@@ -176,7 +176,7 @@ def _column(field: Any, count: int, rng: np.random.Generator, limits: Limits) ->
     return np.asarray(rng.integers(low, high, count, dtype=kind, endpoint=True))
 
 
-def _turned(columns: Columns) -> None:
+def _turn(columns: Columns) -> None:
     """Make quaternions of unit length of the columns of orientations."""
     for name in [name for name in columns if name.endswith("orientation_w")]:
         parts = [columns[name[:-1] + part] for part in "xyzw"]

@@ -23,7 +23,7 @@ from tests.clouds.scene_fakes import scene
 from tests.fake_recordings import FakeRecording
 
 
-def acquired(sensor: Sensor, chunk: bytes) -> pa.Table:
+def acquire(sensor: Sensor, chunk: bytes) -> pa.Table:
     """Return the table of a stream of which one chunk came."""
     reading = LinkReader(sensor)
     batch = reading.feed(Chunks.from_pairs([(5, chunk)]))
@@ -41,8 +41,8 @@ def test_segment_grasps_takes_what_a_folder_and_a_tap_gave(kind: Any) -> None:
     record = {"g1": grasp.g1_m.tolist(), "g2": grasp.g2_m.tolist(), "R": wrist.tolist()}
 
     acquired_streams = {
-        "scene": acquired(Clouds(), point_files.pack_ply(full_scene.cloud.points_m, full_scene.cloud.colours)),
-        "grasp": acquired(Tap(grasp=kind), json.dumps({"grasp": record}).encode()),
+        "scene": acquire(Clouds(), point_files.pack_ply(full_scene.cloud.points_m, full_scene.cloud.colours)),
+        "grasp": acquire(Tap(grasp=kind), json.dumps({"grasp": record}).encode()),
     }
 
     expected_streams = {"scene": full_scene.cloud.table(), "grasp": grasp.table(5)}

@@ -15,24 +15,24 @@ RATE_HZ = 1000.0
 PERIOD_NS = 1_000_000
 
 
-def counted(counting: CounterUnroller, first: int, count: int, at_s: float) -> UnrolledCounters:
+def count_items(counting: CounterUnroller, first: int, count: int, at_s: float) -> UnrolledCounters:
     """Feed counters from ``first`` on, one a period from ``at_s`` on, as a device sends them that wraps."""
     rows: Int64s = np.arange(count, dtype=np.int64)
     return counting.feed((first + rows) * counting.step % counting.modulus, round(at_s * 1e9) + rows * PERIOD_NS)
 
 
-def interrupted(
+def interrupt(
     first: int, outage_s: float, after: int, modulus: int = WRAP, rate_hz: float = RATE_HZ
 ) -> UnrolledCounters:
     """Return what is made of 10 counters from ``after`` on, behind one of ``first`` and an outage."""
     counting = CounterUnroller(modulus, rate_hz)
-    counted(counting, first, 1, 0)
+    count_items(counting, first, 1, 0)
     counting.note_reopened()
-    return counted(counting, after, 10, outage_s)
+    return count_items(counting, after, 10, outage_s)
 
 
 def test_a_device_that_began_anew_while_it_was_away_is_reset_and_the_clock_tells_the_loss() -> None:
-    counters = interrupted(60_000, outage_s=10, after=0)
+    counters = interrupt(60_000, outage_s=10, after=0)
 
     assert counters.missing.tolist() == [9_999] + [0] * 9
     assert counters.reset.tolist() == [True] + [False] * 9
@@ -43,7 +43,7 @@ def test_a_device_that_began_anew_while_it_was_away_is_reset_and_the_clock_tells
 def test_a_device_that_went_on_counting_while_the_link_was_away_loses_what_its_counter_says(
     first: int, lost_count: int, drift: float
 ) -> None:
-    counters = interrupted(first, outage_s=lost_count * (1 + drift) / RATE_HZ, after=first + lost_count)
+    counters = interrupt(first, outage_s=lost_count * (1 + drift) / RATE_HZ, after=first + lost_count)
 
     # Beyond 5 % of 655 s the clock cannot show how often a counter of 65 s wrapped.
     if lost_count * abs(drift) < WRAP / 2 - 100:
@@ -55,7 +55,7 @@ def test_a_device_that_went_on_counting_while_the_link_was_away_loses_what_its_c
 def test_whatever_a_device_begins_with_the_loss_is_about_what_the_clock_says(
     first: int, after: int, outage_s: float
 ) -> None:
-    counters = interrupted(first, outage_s, after)
+    counters = interrupt(first, outage_s, after)
 
     expected = outage_s * RATE_HZ
     assert abs(int(counters.missing[0]) + 1 - expected) <= 33 + 0.05 * expected
@@ -65,7 +65,7 @@ def test_whatever_a_device_begins_with_the_loss_is_about_what_the_clock_says(
 
 @pytest.mark.parametrize("after", [95, 100])
 def test_a_counter_that_stands_or_is_a_little_back_after_an_outage_began_anew(after: int) -> None:
-    counters = interrupted(100, outage_s=0.005, after=after)
+    counters = interrupt(100, outage_s=0.005, after=after)
 
     assert counters.reset[0] and counters.missing[0] == 4
     assert not counters.duplicate.any() and not counters.late.any()
@@ -74,26 +74,26 @@ def test_a_counter_that_stands_or_is_a_little_back_after_an_outage_began_anew(af
 def test_only_the_first_sample_after_an_outage_is_doubted() -> None:
     counting = CounterUnroller(WRAP, RATE_HZ)
     counting.note_reopened()  # Before the first sample there is nothing to doubt.
-    assert not counted(counting, 500, 3, 0).reset.any()
+    assert not count_items(counting, 500, 3, 0).reset.any()
     counting.note_reopened()
-    assert len(counted(counting, 0, 0, 1).seq) == 0  # nothing came yet
-    assert counted(counting, 0, 3, 1).reset.tolist() == [True, False, False]
-    lost = counted(counting, 38, 2, 1.004)  # 36 in 2 ms: a burst may bring so many, but no outage was before
+    assert len(count_items(counting, 0, 0, 1).seq) == 0  # nothing came yet
+    assert count_items(counting, 0, 3, 1).reset.tolist() == [True, False, False]
+    lost = count_items(counting, 38, 2, 1.004)  # 36 in 2 ms: a burst may bring so many, but no outage was before
 
     assert lost.missing.tolist() == [35, 0] and not lost.reset.any()
 
 
 def test_where_no_rate_is_known_a_counter_that_grew_is_believed() -> None:
-    assert interrupted(10, 5, after=30, rate_hz=0).missing.tolist() == [19] + [0] * 9
-    counters = interrupted(10, 5, after=0, rate_hz=0)
+    assert interrupt(10, 5, after=30, rate_hz=0).missing.tolist() == [19] + [0] * 9
+    counters = interrupt(10, 5, after=0, rate_hz=0)
     assert counters.reset[0] and counters.missing[0] == 0
 
 
 def test_a_counter_that_grows_by_more_than_one_is_doubted_in_samples() -> None:
     counting = CounterUnroller(1 << 16, RATE_HZ, step=4)
-    counted(counting, 0, 1, 0)
+    count_items(counting, 0, 1, 0)
     counting.note_reopened()
-    went_on = counted(counting, 3_000, 2, 3)
+    went_on = count_items(counting, 3_000, 2, 3)
     counting.note_reopened()
     off = counting.feed(np.array([(6_000 * 4 + 1) % WRAP]), np.array([6_001_000_000]))
 

@@ -31,7 +31,7 @@ def scans(count: int, sensor: IcubSkin = PATCH, seed: int = 0) -> list[list[byte
     return [[scan[start : start + CAN].tobytes() for start in range(0, len(scan), CAN)] for scan in frames]
 
 
-def timed(sent: list[list[bytes]], period_ns: int = 20 * MS) -> list[tuple[int, bytes]]:
+def measure_time(sent: list[list[bytes]], period_ns: int = 20 * MS) -> list[tuple[int, bytes]]:
     """Return CAN frames 130 µs after one another within a scan, scans a period apart."""
     return [
         (row * period_ns + place * 130_000, data) for row, scan in enumerate(sent) for place, data in enumerate(scan)
@@ -92,7 +92,7 @@ def test_what_is_encoded_is_decoded(old: bool, seed: int) -> None:
 @given(at_once=st.integers(1, 40), first=st.integers(0, 5))
 def test_scans_are_whole_however_they_are_cut(at_once: int, first: int) -> None:
     sent = scans(10)
-    chunks = timed(sent)[first:]
+    chunks = measure_time(sent)[first:]
 
     frames, losses = feed_in_batches(chunks, at_once)
 
@@ -109,7 +109,9 @@ def test_scans_are_whole_however_they_are_cut(at_once: int, first: int) -> None:
 )
 def test_torn_scans_are_lost_and_never_mixed(lost: set[int], doubled: set[int], at_once: int) -> None:
     sent = scans(12)
-    chunks = [entry for row, entry in enumerate(timed(sent)) if row not in lost for _ in range(1 + (row in doubled))]
+    chunks = [
+        entry for row, entry in enumerate(measure_time(sent)) if row not in lost for _ in range(1 + (row in doubled))
+    ]
 
     frames, losses = feed_in_batches(chunks, at_once)
 
@@ -122,7 +124,7 @@ def test_torn_scans_are_lost_and_never_mixed(lost: set[int], doubled: set[int], 
 
 def test_a_loss_as_long_as_a_scan_does_not_join_two_halves() -> None:
     sent = scans(4)
-    flat = timed(sent)
+    flat = measure_time(sent)
     chunks = flat[:8] + flat[14:]  # The gap runs from the second scan's third CAN frame to the third scan's second.
 
     frames, losses = feed_in_batches(chunks, 100)
@@ -134,7 +136,7 @@ def test_a_loss_as_long_as_a_scan_does_not_join_two_halves() -> None:
 @pytest.mark.parametrize("at_once", [1, 4, 100])
 def test_each_torn_scan_counts_once(at_once: int) -> None:
     sent = scans(6)
-    flat = timed(sent)
+    flat = measure_time(sent)
     chunks = [entry for row, entry in enumerate(flat) if row not in (8, 20, 21)]  # Arrival times of scans 1 and 3.
 
     _, losses = feed_in_batches(chunks, at_once)
@@ -143,8 +145,10 @@ def test_each_torn_scan_counts_once(at_once: int) -> None:
 
 
 def test_other_boards_on_the_bus_are_left_out_and_do_not_tear() -> None:
-    sent, other_boards = scans(4), timed(scans(4, IcubSkin(board=10, triangles=(0, 1, 5))))
-    chunks = sorted(timed(sent) + other_boards + [(5, can_frame(0x209, b"\x07\x00"))], key=lambda entry: entry[0])
+    sent, other_boards = scans(4), measure_time(scans(4, IcubSkin(board=10, triangles=(0, 1, 5))))
+    chunks = sorted(
+        measure_time(sent) + other_boards + [(5, can_frame(0x209, b"\x07\x00"))], key=lambda entry: entry[0]
+    )
 
     frames, losses = feed_in_batches(chunks, 7)
 
@@ -157,7 +161,7 @@ def test_other_boards_on_the_bus_are_left_out_and_do_not_tear() -> None:
     ids=["another first byte", "short data", "short frame"],
 )
 def test_a_can_frame_that_is_none_of_a_scan_tears_it(harmed: bytes) -> None:
-    chunks = timed([SCAN, [*SCAN[:2], harmed, *SCAN[3:]], SCAN])
+    chunks = measure_time([SCAN, [*SCAN[:2], harmed, *SCAN[3:]], SCAN])
 
     frames, losses = feed_in_batches(chunks, 100)
 

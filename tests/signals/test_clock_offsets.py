@@ -12,7 +12,7 @@ RNG = np.random.default_rng(3)
 EVERY_NS = 5_000_000_000
 
 
-def measured(count: int, drift: float, noise_ns: float = 0.0, start_ns: int = 0) -> tuple[Int64s, Int64s]:
+def measure(count: int, drift: float, noise_ns: float = 0.0, start_ns: int = 0) -> tuple[Int64s, Int64s]:
     device_ns = start_ns + np.arange(count, dtype=np.int64) * EVERY_NS
     offset_ns = 123_456_789_012 + np.rint(device_ns * drift + RNG.normal(0, noise_ns, count)).astype(np.int64)
     return device_ns, offset_ns
@@ -20,7 +20,7 @@ def measured(count: int, drift: float, noise_ns: float = 0.0, start_ns: int = 0)
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -200e-6])
 def test_the_line_is_the_true_one_within_the_noise_of_its_measurements(drift: float) -> None:
-    device_ns, offset_ns = measured(200, drift, noise_ns=200_000)
+    device_ns, offset_ns = measure(200, drift, noise_ns=200_000)
     offset_ns[[20, 77, 150]] += [40_000_000, -90_000_000, 300_000_000]  # Three measurements were held up on their way
 
     lines = fit_offsets(device_ns, offset_ns)
@@ -35,7 +35,7 @@ def test_the_line_is_the_true_one_within_the_noise_of_its_measurements(drift: fl
 @pytest.mark.parametrize("set_by_s", [-3600.0, -100.0, 7.0, 86_400.0])
 def test_a_reset_begins_a_line_of_its_own(set_by_s: float) -> None:
     set_by_ns = round(set_by_s * 1e9)
-    device_ns, offset_ns = measured(60, 20e-6, noise_ns=100_000, start_ns=10**13)
+    device_ns, offset_ns = measure(60, 20e-6, noise_ns=100_000, start_ns=10**13)
     device_ns[30:] += set_by_ns
     offset_ns[30:] -= set_by_ns
 
@@ -52,7 +52,7 @@ def test_a_few_measurements_show_an_offset_and_no_drift() -> None:
 
 
 def test_a_measurement_that_is_garbage_at_the_end_is_no_reset() -> None:
-    device_ns, offset_ns = measured(20, 0.0)
+    device_ns, offset_ns = measure(20, 0.0)
     offset_ns[-1] += 10**12
     (line,) = fit_offsets(device_ns, offset_ns)
     assert line.host_ns == 123_456_789_012 and line.drift == 0.0

@@ -90,7 +90,7 @@ def test_intervals_are_sorted_disjoint_and_hold_every_row_at_or_above_on(
     assert inside[values >= 5.0].all()
 
 
-def touched(rows: int, peak: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def touch(rows: int, peak: float, noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (time, channel) of three taxels at 100 Hz, pressed in the second half, and the rows' times."""
     rng = np.random.default_rng(seed)
     values = rng.normal(0, noise, (rows, 9)) + 3.0
@@ -104,7 +104,7 @@ def thresholds(values: np.ndarray, t_ns: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("scale", [1e-6, 0.004, 1.0, 5000.0])
 def test_thresholds_of_the_noise_follow_the_unit(scale: float) -> None:
-    values, t_ns = touched(400, 500.0, 1.0)
+    values, t_ns = touch(400, 500.0, 1.0)
     unscaled, scaled = thresholds(values, t_ns), thresholds(scale * values, t_ns)
     assert np.allclose(scaled, np.array(unscaled) * scale, rtol=1e-9)
     assert 40 < unscaled[0] < 125 and unscaled[1] == pytest.approx(unscaled[0] * 2 / 3)
@@ -121,7 +121,7 @@ def test_thresholds_of_the_noise_follow_the_unit(scale: float) -> None:
 def test_thresholds_of_the_noise_lie_between_noise_and_load(
     peak: float, noise: float, lowest: float, highest: float
 ) -> None:
-    values, t_ns = touched(400, peak, noise)
+    values, t_ns = touch(400, peak, noise)
     on, _ = thresholds(values, t_ns)
     assert lowest < on < highest
     distance = load(values, rest_level(values, t_ns, 0.2))
@@ -129,7 +129,7 @@ def test_thresholds_of_the_noise_lie_between_noise_and_load(
 
 
 def test_repeated_samples_and_one_wrong_frame_at_rest_leave_the_thresholds_of_the_noise() -> None:
-    values, t_ns = touched(400, 500.0, 1.0)
+    values, t_ns = touch(400, 500.0, 1.0)
     usual, _ = thresholds(values, t_ns)
     repeated = np.repeat(values[::4], 4, axis=0)
     assert 0.4 * usual < thresholds(repeated, t_ns)[0] < 2.5 * usual
@@ -138,7 +138,7 @@ def test_repeated_samples_and_one_wrong_frame_at_rest_leave_the_thresholds_of_th
 
 
 def test_without_any_load_no_threshold_is_reached() -> None:
-    values, t_ns = touched(100, 0.0, 0.0)
+    values, t_ns = touch(100, 0.0, 0.0)
     assert thresholds(values, t_ns) == (np.inf, np.inf)
     assert thresholds(np.full_like(values, np.nan), t_ns) == (np.inf, np.inf)
 

@@ -37,7 +37,7 @@ def true_px(trial: dict[str, pa.Table], name: str) -> Floats:
     return np.column_stack(columns).reshape(truth.num_rows, -1, 2)
 
 
-def tracked(frames: pa.Table) -> pa.Table:
+def track(frames: pa.Table) -> pa.Table:
     """Return what `extract markers` measures of all markers."""
     output = load("extract.markers").function(
         build_params("extract.markers", rows=gel.ROWS, columns=gel.COLUMNS), FakeRecording({"gel": frames})
@@ -75,7 +75,7 @@ def test_the_markers_of_both_fingers_carry_the_load_of_the_object(trial: dict[st
 def test_markers_are_measured_to_a_fifth_of_a_pixel_up_to_half_their_distance(
     trial: dict[str, pa.Table], name: str
 ) -> None:
-    true, measured = true_px(trial, name), measured_px(tracked(trial[name]))
+    true, measured = true_px(trial, name), measured_px(track(trial[name]))
     assert measured.shape == true.shape
     length = np.linalg.norm(true, axis=2)
     inside = length <= gel.PITCH_PX / 2
@@ -97,7 +97,7 @@ def test_covered_markers_are_null_and_never_invented(trial: dict[str, pa.Table])
         image[80:150, 100:200] = [110, 120, 135]  # a patch without markers
     column = pa.array(list(encode_images(video_format, images)), pa.binary())
     covered = frames.set_column(frames.column_names.index("packet"), frames.field("packet"), column)
-    channels = tracked(covered)
+    channels = track(covered)
     measured, true = measured_px(channels), true_px(trial, "gel1")
     places = gel.rest_places_px() + true
     hidden = np.all((places > [100 + 8, 80 + 8]) & (places < [200 - 8, 150 - 8]), axis=2)  # (time, marker)
@@ -112,6 +112,6 @@ def test_covered_markers_are_null_and_never_invented(trial: dict[str, pa.Table])
 
 
 def test_a_row_is_the_same_bit_for_bit_whatever_follows_it(trial: dict[str, pa.Table]) -> None:
-    whole = tracked(trial["gel2"])
+    whole = track(trial["gel2"])
     for count in (1, 2, 37):
-        assert tracked(trial["gel2"].slice(0, count)).equals(whole.slice(0, count))
+        assert track(trial["gel2"].slice(0, count)).equals(whole.slice(0, count))

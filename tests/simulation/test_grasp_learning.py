@@ -115,7 +115,7 @@ def test_colours_that_tell_nothing_do_not_help(tmp_path: Path) -> None:
     gains: dict[str, list[float]] = {target: [] for target in biotac_sp.TARGETS}
     for fold in range(4):
         training, tested = (
-            type(dataset)({name: dataset.recordings[name] for name in part}, {}) for part in _parted(names, fold)
+            type(dataset)({name: dataset.recordings[name] for name in part}, {}) for part in _part(names, fold)
         )
         errors = [
             evaluated(training, tested, tmp_path / f"{fold}-{inputs}", inputs=inputs, leaf=4)["model"]["rmse"]
@@ -144,7 +144,7 @@ def test_who_is_not_told_where_a_grasp_is_cannot_beat_the_mean_of_its_object_and
         assert errors["xyzcont"][target] < 0.95 * mean[target]
 
 
-def _parted(names: list[str], fold: int) -> tuple[list[str], list[str]]:
+def _part(names: list[str], fold: int) -> tuple[list[str], list[str]]:
     """Return three quarters of the names, and the quarter that the fold tests."""
     tested = names[fold::4]
     return [name for name in names if name not in tested], tested

@@ -47,7 +47,7 @@ def threshold_m_s2(mass_kg: float, grip_n: float, friction: float, rate_hz: floa
     return high
 
 
-def twisted(lever_m: float, friction: float = 0.5) -> Contact:
+def twist(lever_m: float, friction: float = 0.5) -> Contact:
     return carry(HeldObject(0.36, friction, np.full(3000, 6.0), lever_m), np.zeros((3000, 3)))
 
 
@@ -161,7 +161,7 @@ def test_an_object_let_go_falls_freely_and_lies_where_it_lands() -> None:
 
 @pytest.mark.parametrize("lever_m", [0.002, 0.004, 0.008])
 def test_a_lever_turns_the_object_where_soft_fingers_cannot_hold_it(lever_m: float) -> None:
-    motion = twisted(lever_m)
+    motion = twist(lever_m)
     weight = 0.36 * GRAVITY_M_S2
     limit = 2 * (2 / 3) * 0.5 * 6.0 * PATCH_M
     if lever_m * weight < limit:
@@ -173,7 +173,7 @@ def test_a_lever_turns_the_object_where_soft_fingers_cannot_hold_it(lever_m: flo
 
 
 def test_a_slippery_grasp_swings_until_friction_stops_it() -> None:
-    motion = twisted(0.02, friction=0.35)
+    motion = twist(0.02, friction=0.35)
     inertia = 0.36 * (GYRATION_M**2 + 0.02**2)
     weight, braking = 0.36 * GRAVITY_M_S2, KINETIC * 2 * (2 / 3) * 0.35 * 6.0 * PATCH_M
     first = np.diff(motion.rotation_rad[:4], n=2)[0] * 1e6

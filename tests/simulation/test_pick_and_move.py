@@ -42,7 +42,7 @@ def tactile(table: pa.Table) -> np.ndarray:
     return counts
 
 
-def decoded(scene: PickScene, recording: Any, finger: int) -> np.ndarray:
+def decode(scene: PickScene, recording: Any, finger: int) -> np.ndarray:
     """Return the force on a finger (time, axis) from its counts, with base, gains and cross-talk known."""
     force = taxels.forces(scene.skins[finger], tactile(recording.streams[f"xela{finger + 1}"]))
     summed: np.ndarray = force.sum(axis=1)
@@ -55,7 +55,7 @@ def test_the_counts_tell_weight_and_inertia(protocol: str, seed: int) -> None:
     scene, recording = perform(seed, 0, rig), simulate_trial(seed, 0, rig)
     mass = scene.grasp.mass_kg
     t_ns = column(recording.streams["xela1"], "t_ns"), column(recording.streams["xela2"], "t_ns")
-    ours, theirs = decoded(scene, recording, 0)[:, 1], decoded(scene, recording, 1)[:, 1]
+    ours, theirs = decode(scene, recording, 0)[:, 1], decode(scene, recording, 1)[:, 1]
     vertical = ours + np.interp(t_ns[0], t_ns[1], theirs)
     truth = recording.streams["truth"]
     acceleration = np.interp(t_ns[0], column(truth, "t_ns"), column(truth, "gt_acceleration_z_m_s2"))

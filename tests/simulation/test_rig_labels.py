@@ -20,20 +20,20 @@ simulate, synchronize = load("simulate.forward"), load("synchronize")
 contacts, slips = load("segment.contacts"), load("segment.slips")
 
 
-def recorded(trial: int, **rig: Any) -> RecordingOutput:
+def record(trial: int, **rig: Any) -> RecordingOutput:
     recording: RecordingOutput = simulate(simulate.params(**rig), trial)
     return recording
 
 
-def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
+def sync(recording: RecordingOutput, **params: Any) -> RecordingOutput:
     rows = {"values": "interpolate", **({} if "grid" in params else {"rate_hz": 50.0}), **params}
     synced_recording: RecordingOutput = synchronize(synchronize.params(**rows), FakeRecording(recording.streams))
     return synced_recording
 
 
 @cache
-def labelled(trial: int, **rig: Any) -> pa.Table:
-    table = synced(recorded(trial, **rig)).streams[""]
+def label(trial: int, **rig: Any) -> pa.Table:
+    table = sync(record(trial, **rig)).streams[""]
     return slips(slips.params(), FakeRecording(contacts(contacts.params(), FakeRecording({"": table})).streams))
 
 
@@ -51,7 +51,7 @@ def flags(table: pa.Table, name: str) -> np.ndarray:
     ],
 )
 def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], lowest_score: float) -> None:
-    tables = [labelled(trial, **rig) for trial in range(TRIALS)]
+    tables = [label(trial, **rig) for trial in range(TRIALS)]
     predicted = np.concatenate([flags(table, "slip") for table in tables])
     truth = np.concatenate([flags(table, "gt_slip") for table in tables])
     assert 2 * (predicted & truth).sum() / (predicted.sum() + truth.sum()) >= lowest_score
@@ -60,7 +60,7 @@ def test_the_slip_label_is_that_of_the_mechanics(rig: dict[str, float], lowest_s
 @pytest.mark.long
 def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
     for trial in range(TRIALS):
-        table = labelled(trial, effort=1.15)
+        table = label(trial, effort=1.15)
         predicted, truth = flags(table, "dropped"), flags(table, "gt_dropped")
         assert predicted.any() == truth.any()
         assert abs(int(predicted.argmax()) - int(truth.argmax())) <= 2
@@ -68,7 +68,7 @@ def test_an_object_is_dropped_within_two_rows_of_its_fall() -> None:
 
 @pytest.mark.long
 def test_where_nothing_slips_there_is_at_most_one_false_frame_a_minute() -> None:
-    tables = [labelled(trial, friction_scale=4.0) for trial in range(TRIALS)]
+    tables = [label(trial, friction_scale=4.0) for trial in range(TRIALS)]
     assert not any(flags(table, "gt_slip").any() for table in tables)
     minutes = sum(table.num_rows for table in tables) / 50 / 60
     for name in ("slip", "slip_online", "dropped"):
@@ -78,8 +78,8 @@ def test_where_nothing_slips_there_is_at_most_one_false_frame_a_minute() -> None
 def test_the_offset_of_each_clock_is_known_to_a_fraction_of_a_sample() -> None:
     half_ms = {"xela1": 10.0, "xela2": 10.0, "robot": 0.5, "proximity": 1.25}
     for trial in range(TRIALS):
-        recording = recorded(trial)
-        attributes = synced(recording).attributes
+        recording = record(trial)
+        attributes = sync(recording).attributes
         for stream, limit_ms in half_ms.items():
             offset_ms, true_ns = (
                 attributes[f"{stream}_clock_offset_ms"],
@@ -92,7 +92,7 @@ def test_the_offset_of_each_clock_is_known_to_a_fraction_of_a_sample() -> None:
 def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return how far the channels of each finger, then of the arm, lie from the truth on the grid, in units of its sd."""
     rig = {"noise_scale": 0.0, "hold_probability": 0.0, "friction_scale": 4.0}
-    table = synced(recorded(trial, **rig), clock=clock).streams[""]
+    table = sync(record(trial, **rig), clock=clock).streams[""]
     scene = pick_and_move.perform(0, trial, pick_and_move.PickRig(**rig))  # type: ignore[arg-type]
     true_ns = table.column("t_ns").to_numpy() - pick_and_move.START_NS - trial * pick_and_move.TRIAL_NS
     fingers = []
@@ -128,7 +128,7 @@ def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_th
 def test_held_frames_are_found() -> None:
     hits = marked_rows = repeated_rows = 0
     for trial, probability in ((0, 0.07), (1, 0.07), (2, 0.75)):
-        streams = dict(recorded(trial, hold_probability=0.0).streams)
+        streams = dict(record(trial, hold_probability=0.0).streams)
         kinds = [kind for kind in streams["xela1"].schema if "taxel" in kind.name]
         counts = np.column_stack([streams["xela1"].column(kind.name).to_numpy() for kind in kinds])
         counts, repeated = faults.hold(counts, probability, np.random.default_rng(trial))
@@ -136,7 +136,7 @@ def test_held_frames_are_found() -> None:
         repeated_stream = schema.stream(first.column("t_ns").to_numpy(), counts.T, kinds)
         for name in ("t_device_ns", "seq"):
             repeated_stream = repeated_stream.append_column(first.schema.field(name), first.column(name))
-        table = synced(RecordingOutput({**streams, "xela1": repeated_stream}), grid="logged").streams[""]
+        table = sync(RecordingOutput({**streams, "xela1": repeated_stream}), grid="logged").streams[""]
         rows = np.searchsorted(first.column("seq").to_numpy(), table.column("xela1_seq").to_numpy())
         marked = flags(table, "xela1_held")
         hits, marked_rows, repeated_rows = (

@@ -27,18 +27,18 @@ def fitted(*shards: FakeShard, **options: float | str) -> dict[str, bytes]:
     return dict(FIT(PCA.params(**({"components": 3} | options)), dataset(*shards)).files)
 
 
-def compressed(shard: FakeShard, files: dict[str, bytes]) -> pa.Table:
+def compress(shard: FakeShard, files: dict[str, bytes]) -> pa.Table:
     return PCA(PCA.params(), shard, files)
 
 
-def learned(folder: Path, *shards: FakeShard, **options: Any) -> dict[str, bytes]:
+def learn(folder: Path, *shards: FakeShard, **options: Any) -> dict[str, bytes]:
     params = AUTOENCODER.params(**({"components": 3, "hidden": "8", "epochs": 2} | options))
     return dict(FIT_AUTOENCODER(params, dataset(*shards), folder).files)
 
 
 def test_latents_are_added_and_everything_else_stays() -> None:
     shard = RECORDINGS[0]
-    encoded = compressed(shard, fitted(*RECORDINGS))
+    encoded = compress(shard, fitted(*RECORDINGS))
     assert encoded.column_names == [*shard.content.column_names, "z00", "z01", "z02"]
     assert encoded.select(shard.content.column_names).equals(shard.content, check_metadata=True)
     assert encoded.schema.field("z01").metadata == {b"quantity": b"latent", b"unit": b"1"}
@@ -48,14 +48,14 @@ def test_latents_are_added_and_everything_else_stays() -> None:
 def test_the_rest_level_of_each_recording_is_taken_off() -> None:
     files = fitted(*RECORDINGS)
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
-    drifted = compressed(FakeShard("drifted", table(counts - 700, rest=16000.0 - 700)), files)
+    drifted = compress(FakeShard("drifted", table(counts - 700, rest=16000.0 - 700)), files)
     for name in ("z00", "z01", "z02"):
-        assert np.allclose(drifted[name].to_numpy(), compressed(RECORDINGS[0], files)[name].to_numpy(), atol=1e-4)
+        assert np.allclose(drifted[name].to_numpy(), compress(RECORDINGS[0], files)[name].to_numpy(), atol=1e-4)
 
 
 def test_decoding_gives_back_counts_above_rest() -> None:
     files = fitted(*RECORDINGS, components=len(CHANNELS))
-    encoded = compressed(RECORDINGS[0], files)
+    encoded = compress(RECORDINGS[0], files)
     latents = np.column_stack([encoded[name].to_numpy() for name in codec.load(files).latents])
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
     assert np.allclose(codec.load(files).decode(latents), counts, atol=0.01)
@@ -73,14 +73,14 @@ def test_the_codec_does_not_depend_on_the_order_of_recordings_nor_on_rows_in_gap
 
 
 def test_a_recording_without_rows_is_compressed_to_none() -> None:
-    encoded = compressed(FakeShard("empty", table(np.zeros((0, len(CHANNELS))))), fitted(*RECORDINGS))
+    encoded = compress(FakeShard("empty", table(np.zeros((0, len(CHANNELS))))), fitted(*RECORDINGS))
     assert (encoded.num_rows, encoded.column_names[-1]) == (0, "z02")
 
 
 def test_a_rig_with_other_channels_is_refused_with_the_recordings_name() -> None:
     small = FakeShard("small", table(np.zeros((9, 6))))
     with pytest.raises(TacpipeError, match="small: The codec does not fit this table"):
-        compressed(small, fitted(*RECORDINGS))
+        compress(small, fitted(*RECORDINGS))
     with pytest.raises(TacpipeError, match="trial-00: The codec does not fit this table"):
         fitted(FakeShard("a", table(np.zeros((9, 6)))), RECORDINGS[0])
 
@@ -99,14 +99,14 @@ def test_rows_outside_of_contact_are_encoded_and_not_learned() -> None:
     contact = np.where(np.arange(80) < 30, -1, 0)
     inside, marked = FakeShard("a", table(values[30:])), FakeShard("a", table(wild, contact=contact))
     assert fitted(marked) == fitted(inside)
-    assert np.isfinite(compressed(marked, fitted(marked))["z00"].to_numpy()).all()
+    assert np.isfinite(compress(marked, fitted(marked))["z00"].to_numpy()).all()
 
 
 def test_rows_that_are_not_finite_get_latents_that_are_not() -> None:
     values = np.random.default_rng(0).normal(size=(80, len(CHANNELS)))
     values[9, 4] = np.nan
     shard = FakeShard("a", table(values))
-    encoded = compressed(shard, fitted(shard))
+    encoded = compress(shard, fitted(shard))
     assert np.isnan(encoded["z01"].to_numpy()).nonzero()[0].tolist() == [9]
 
 
@@ -114,8 +114,8 @@ def test_increments_do_not_reach_across_a_gap_in_time() -> None:
     files = fitted(*RECORDINGS, representation="increments")
     content = RECORDINGS[0].content
     cut = FakeShard("cut", content.take([*range(20), *range(30, 80)]))
-    latents = compressed(cut, files)["z00"].to_numpy()
-    uncut = compressed(RECORDINGS[0], files)["z00"].to_numpy()
+    latents = compress(cut, files)["z00"].to_numpy()
+    uncut = compress(RECORDINGS[0], files)["z00"].to_numpy()
     assert latents[0] == latents[20] == 0
     assert np.allclose(latents[1:20], uncut[1:20])
     assert np.allclose(latents[21:], uncut[31:])
@@ -130,7 +130,7 @@ def test_codec_json_says_what_latents_stand_for_and_what_is_lost() -> None:
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_an_autoencoder_adds_its_latents_and_everything_else_stays(tmp_path: Path, frames: int) -> None:
-    files = learned(tmp_path, *RECORDINGS, frames=frames)
+    files = learn(tmp_path, *RECORDINGS, frames=frames)
     encoded = AUTOENCODER(AUTOENCODER.params(), RECORDINGS[0], files)
     assert encoded.column_names == [*RECORDINGS[0].content.column_names, "z00", "z01", "z02"]
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
@@ -143,13 +143,13 @@ def test_an_autoencoder_adds_its_latents_and_everything_else_stays(tmp_path: Pat
 
 
 def test_an_autoencoder_is_the_same_for_the_same_seed_and_another_for_another(tmp_path: Path) -> None:
-    first, second = learned(tmp_path / "a", *RECORDINGS), learned(tmp_path / "b", *reversed(RECORDINGS))
+    first, second = learn(tmp_path / "a", *RECORDINGS), learn(tmp_path / "b", *reversed(RECORDINGS))
     assert first == second
-    assert learned(tmp_path / "c", *RECORDINGS, seed=1) != first
+    assert learn(tmp_path / "c", *RECORDINGS, seed=1) != first
 
 
 def test_a_rig_with_other_channels_is_refused_by_an_autoencoder_too(tmp_path: Path) -> None:
-    files = learned(tmp_path, *RECORDINGS)
+    files = learn(tmp_path, *RECORDINGS)
     with pytest.raises(TacpipeError, match="small: The codec does not fit this table"):
         AUTOENCODER(AUTOENCODER.params(), FakeShard("small", table(np.zeros((9, 6)))), files)
 
@@ -159,7 +159,7 @@ def test_another_kind_of_value_is_refused_before_anything_is_fitted(tmp_path: Pa
     with pytest.raises(TacpipeError, match=r"^representation is .*levels.*increments"):
         fitted(*RECORDINGS, **how)
     with pytest.raises(TacpipeError, match=r"^representation is .*levels.*increments"):
-        learned(tmp_path, *RECORDINGS, **how)
+        learn(tmp_path, *RECORDINGS, **how)
 
 
 def test_an_array_with_fewer_channels_than_latents_keeps_as_many_as_it_has_and_a_note_says_so() -> None:

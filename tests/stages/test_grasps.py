@@ -25,7 +25,7 @@ grasps = load("segment.grasps")
 Recording = Callable[..., Any]
 
 
-def touched(rows: int = 300) -> pa.Table:
+def touch(rows: int = 300) -> pa.Table:
     """Return both fingers' stream: channel k has the level 1000 + k, and 300 more from row `SETTLED` on."""
     level = 1000 + np.arange(58)[:, None] + 300 * np.clip((np.arange(rows) - CLOSED) / (SETTLED - CLOSED), 0, 1)
     return schema.stream(START_NS + np.arange(rows) * STEP_NS, list(np.rint(level)), biotac_sp.fields())
@@ -35,7 +35,7 @@ def raw(ball_scene: Scene, **extra_streams: pa.Table) -> dict[str, pa.Table]:
     return {
         "scene": ball_scene.cloud.table(),
         "grasp": ball_scene.grasp.table(START_NS),
-        "biotac_sp": touched(),
+        "biotac_sp": touch(),
         **extra_streams,
     }
 
@@ -132,7 +132,7 @@ def test_the_reading_is_the_median_after_contact_in_the_columns_of_a_finished_on
 
 
 def test_single_wrong_readings_in_the_window_do_not_count(shard: Recording) -> None:
-    stream = touched()
+    stream = touch()
     column = stream.column("mf_electrode07").to_numpy().copy()
     column[[SETTLED + 3, SETTLED + 9]] = 4095
     place = stream.column_names.index("mf_electrode07")
@@ -204,7 +204,7 @@ def test_what_cannot_be_found_is_told_with_the_recording(shard: Recording) -> No
     with pytest.raises(TacpipeError, match="Recording trial: No table was found"):
         cut(shard(raw(ball_scene, scene=Cloud(ball_scene.cloud.points_m[ball_scene.ball]).table())))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
-        cut(shard(raw(ball_scene, biotac_sp=touched(CLOSED))))
+        cut(shard(raw(ball_scene, biotac_sp=touch(CLOSED))))
     with pytest.raises(TacpipeError, match="Recording trial: There is no contact"):
         cut(shard(raw(ball_scene)), on_count=400.0)
     with pytest.raises(TacpipeError, match="Recording trial: No table was found"):

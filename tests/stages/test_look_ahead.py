@@ -48,7 +48,7 @@ def run_stage(name: str, recording: Any, *files: Any, **params: Any) -> Any:
 
 
 @cache
-def recorded(index: int) -> FakeRecording:
+def record(index: int) -> FakeRecording:
     simulate = load("simulate.forward")
     output = simulate(simulate.params(duration_s=SECONDS, seed=3, grip_loss_probability=1.0, grip_loss=0.5), index)
     return FakeRecording(output.streams, f"trial-{index}", output.attributes)
@@ -64,7 +64,7 @@ def codec(name: str) -> Mapping[str, bytes]:
     """Return the files of a codec that is fitted on another recording than those that are cut."""
     stage = load(f"compress.{name.partition(' ')[0]}")
     assert stage.fit is not None
-    recordings = [dataset(*(segmented(recorded(index)) for index in (0, 4)))]
+    recordings = [dataset(*(segmented(record(index)) for index in (0, 4)))]
     with tempfile.TemporaryDirectory() as folder:
         workspace = [] if name.startswith("pca") else [Path(folder)]
         return dict(stage.fit(codec_params(name), *recordings, *workspace).files)
@@ -101,7 +101,7 @@ def test_the_page_has_the_claim_of_each_stage_that_makes_rows() -> None:
 def test_contacts_leave_columns_and_levels_at_rest_as_a_cut_recording_has_them(
     tare: str, index: int, until_ms: int
 ) -> None:
-    recording = recorded(index)
+    recording = record(index)
     until_ns = int(recording.tables["xela1"]["t_ns"][0].as_py()) + until_ms * MS
     part, uncut = (segmented(source, tare=tare) for source in (cut(recording, until_ns), recording))
     rows_before(part.content, uncut.content, "contact")
@@ -133,7 +133,7 @@ def test_marks_of_contacts_look_ahead_by_no_more_than_the_page_states(
 @settings(deadline=None, max_examples=15)
 @given(index=st.integers(1, 3), rows=st.integers(20, int(SECONDS * 1000 / PERIOD_MS)))
 def test_slips_so_far_are_those_of_a_recording_that_is_cut(index: int, rows: int) -> None:
-    uncut = segmented(recorded(index))
+    uncut = segmented(record(index))
     part = FakeShard(uncut.name, uncut.content.slice(0, rows), uncut.attributes)
     marked = [run_stage("segment.slips", shard).content for shard in (part, uncut)]
     assert marked[1]["slip_online"].to_numpy().any()
@@ -147,7 +147,7 @@ def test_latents_and_what_a_forecaster_reads_are_those_of_a_recording_that_is_cu
     name: str, index: int, rows: int
 ) -> None:
     """Compare latents to five digits: products of matrices of other shapes round differently in the last digits."""
-    uncut = segmented(recorded(index))
+    uncut = segmented(record(index))
     part = FakeShard(uncut.name, uncut.content.slice(0, rows), uncut.attributes)
     files = codec(name)
     stage = load(f"compress.{name.partition(' ')[0]}")

@@ -241,7 +241,7 @@ def test_levels_in_other_units_are_part_of_a_key_only_where_they_are_given() -> 
     assert from_json(segment, to_json(segment.params(on_level=0.5))) == segment.params(on_level=0.5)
 
 
-def touched(labelled: pa.Table) -> np.ndarray:
+def touch(labelled: pa.Table) -> np.ndarray:
     """Return the stamps of the rows in contact."""
     return np.asarray(labelled.column("t_ns").to_numpy()[labelled.column("contact").to_numpy() >= 0])
 
@@ -255,8 +255,8 @@ def test_the_contact_of_a_simulated_trial_is_that_of_its_ground_truth(shard: Rec
         pressed = synced.column("gt_finger1_normal_n").to_numpy() > 0
         first = synced.column("t_ns").to_numpy()[pressed.argmax()]
         assert labelled.column("contact").unique().to_pylist() == [-1, 0]
-        assert 0 <= touched(labelled)[0] - first < 0.2e9
-        assert touched(labelled)[-1] == synced.column("t_ns")[-1].as_py()
+        assert 0 <= touch(labelled)[0] - first < 0.2e9
+        assert touch(labelled)[-1] == synced.column("t_ns")[-1].as_py()
 
 
 def looked_at(distance: np.ndarray, contact: np.ndarray | None = None) -> pa.Table:
@@ -366,8 +366,8 @@ def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard:
         lifted = synced.column("t_ns").to_numpy()[(height > height[0] + 0.02).argmax()]
         assert set(labelled.column("contact").unique().to_pylist()) <= {-1, 0}
         assert labelled.num_rows == synced.num_rows
-        assert touched(labelled)[0] < lifted
-        ends = touched(labelled)[-1] == synced.column("t_ns")[-1].as_py()
+        assert touch(labelled)[0] < lifted
+        ends = touch(labelled)[-1] == synced.column("t_ns")[-1].as_py()
         assert ends or recording.attributes["dropped"]
 
 

@@ -32,7 +32,7 @@ def gel(*, slip: bool, moves_s: float = 5.5, leaves_s: float = 6.0, level: float
     return FakeRecording(streams, "trial", {"slip": slip})
 
 
-def segmented(recording: FakeRecording, stream: str = "gel0") -> dict[str, list[float]]:
+def segment(recording: FakeRecording, stream: str = "gel0") -> dict[str, list[float]]:
     """Return first and last time of contact and slip of a stream, in seconds."""
     output = registry.load("segment.losses")(build_params("segment.losses"), recording)
     table = output.streams[stream]
@@ -43,13 +43,13 @@ def segmented(recording: FakeRecording, stream: str = "gel0") -> dict[str, list[
 
 @pytest.mark.parametrize("stream", ["gel0", "gel2"])
 def test_a_slip_lasts_from_the_start_of_the_motion_to_the_last_contact(stream: str) -> None:
-    labels = segmented(gel(slip=True), stream)
+    labels = segment(gel(slip=True), stream)
     assert labels["contact"] == pytest.approx([1.0, 5.96])
     assert labels["slip"] == pytest.approx([5.48, 5.96], abs=0.05)
 
 
 def test_a_release_is_no_slip_and_its_motion_is_no_contact() -> None:
-    labels = segmented(gel(slip=False))
+    labels = segment(gel(slip=False))
     assert labels["slip"] == []
     assert labels["contact"] == pytest.approx([1.0, 5.44], abs=0.05)
 

@@ -48,7 +48,7 @@ def read(file: Path, store: int = 0) -> dict[str, list[pa.RecordBatch]]:
     return batches_by_entity
 
 
-def timed(batches: list[pa.RecordBatch], component: str) -> tuple[np.ndarray, list[Any]]:
+def measure_time(batches: list[pa.RecordBatch], component: str) -> tuple[np.ndarray, list[Any]]:
     """Return the times, nanoseconds since the start, and the values of a component."""
     rows: list[tuple[int, Any]] = []
     for batch in batches:
@@ -80,7 +80,7 @@ def write_and_read(
 def test_the_touch_of_each_finger_is_written_at_its_times(tmp_path: Path) -> None:
     _, entities = write_and_read(tmp_path)
 
-    t_ns, values = timed(entities["/touch/xela1"], "Scalars:scalars")
+    t_ns, values = measure_time(entities["/touch/xela1"], "Scalars:scalars")
     np.testing.assert_array_equal(t_ns, hand.times(hand.SKIN_HZ) - hand.START_NS)
     expected = np.linalg.norm(hand.pressed(), axis=2).mean(axis=1)
     np.testing.assert_allclose(np.ravel(values), expected)
@@ -93,13 +93,13 @@ def test_maps_have_a_disc_a_taxel_in_the_colour_of_its_change_and_an_arrow_of_it
     taxel_map = drawn.taxels[0]
     places = np.array(static(entities["/taxels/xela1/discs"], "Points2D:positions"))
     np.testing.assert_allclose(places, taxel_map.places * (1, -1), rtol=1e-6)
-    t_ns, colours = timed(entities["/taxels/xela1/discs"], "Points2D:colors")
+    t_ns, colours = measure_time(entities["/taxels/xela1/discs"], "Points2D:colors")
     assert len(t_ns) == hand.SECONDS * hand.SKIN_HZ
     low, high = taxels.scale(np.concatenate([taxel_map.magnitude.ravel() for taxel_map in drawn.taxels]))
     last = np.array(colours[-1], np.uint32)
     rgb = np.stack([last >> 24, (last >> 16) & 255, (last >> 8) & 255], axis=-1)
     np.testing.assert_array_equal(rgb, drawing.map_colours(taxel_map.magnitude[-1], low, high))
-    _, vectors = timed(entities["/taxels/xela1/shear"], "Arrows2D:vectors")
+    _, vectors = measure_time(entities["/taxels/xela1/shear"], "Arrows2D:vectors")
     assert np.array(vectors[0]).any() == np.False_
     right, up = np.array(vectors[-1]).T
     assert (right > 0).all() and not up.any()  # The shear is only along x.
@@ -109,9 +109,9 @@ def test_spans_begin_and_end_at_their_moments(tmp_path: Path) -> None:
     _, entities = write_and_read(tmp_path)
 
     for lane, states in {"contact": [(1.0, "contact 0"), (3.0, "")], "slip": [(2.5, "slip"), (3.0, "")]}.items():
-        t_ns, values = timed(entities[f"/spans/{lane}"], "StateChange:state")
+        t_ns, values = measure_time(entities[f"/spans/{lane}"], "StateChange:state")
         assert [(t / 1e9, state[0]) for t, state in zip(t_ns.tolist(), values, strict=True)] == states
-    _, texts = timed(entities["/events"], "TextLog:text")
+    _, texts = measure_time(entities["/events"], "TextLog:text")
     assert "cut" in texts[0][0]
 
 
@@ -122,7 +122,7 @@ def test_long_lines_are_envelopes_unless_all_rows_are_wanted(tmp_path: Path, mon
     for all_rows, row_limit in ((False, 500), (True, hand.SECONDS * hand.ARM_HZ)):
         (tmp_path / str(all_rows)).mkdir()
         (file,) = session.write([drawn], tmp_path / str(all_rows), "hand", all_rows=all_rows)
-        values = np.array(timed(read(file)[path], "Scalars:scalars")[1])
+        values = np.array(measure_time(read(file)[path], "Scalars:scalars")[1])
         assert row_limit - 2 <= len(values) <= row_limit
         assert values[:, 0].max() == drawn.paths[0].position_m[:, 0].max()
 
@@ -131,10 +131,10 @@ def test_arm_clouds_and_cameras_are_written(tmp_path: Path) -> None:
     scene = pa.table({f"{axis}_m": np.arange(6.0) for axis in "xyz"})
     drawn, entities = write_and_read(tmp_path, scene=scene)
 
-    _, places = timed(entities["/space/robot/now"], "Transform3D:translation")
+    _, places = measure_time(entities["/space/robot/now"], "Transform3D:translation")
     np.testing.assert_allclose(places[-1][0], drawn.paths[0].position_m[-1], rtol=1e-6)
     assert len(static(entities["/space/scene"], "Points3D:positions")) == 6
-    t_ns, blobs = timed(entities["/cameras/camera"], "EncodedImage:blob")
+    t_ns, blobs = measure_time(entities["/cameras/camera"], "EncodedImage:blob")
     np.testing.assert_array_equal(t_ns, hand.times(hand.SKIN_HZ)[::10] - hand.START_NS)
     assert bytes(blobs[0][0]) == hand.PNG
 
@@ -145,7 +145,7 @@ def test_forecasts_stand_next_to_what_came_with_their_error(tmp_path: Path) -> N
     (file,) = session.write([drawn], tmp_path, "hand")
     entities = read(file)
 
-    t_ns, values = timed(entities["/error/xela1/t\\+10"], "Scalars:scalars")
+    t_ns, values = measure_time(entities["/error/xela1/t\\+10"], "Scalars:scalars")
     np.testing.assert_allclose(np.ravel(values), 4.0)
     assert t_ns[0] == 10 * 1_000_000_000 // hand.SKIN_HZ
     assert "/taxels/xela1\\ residual\\ t\\+10/discs" in entities and "/forecast/xela1/measured" in entities
@@ -201,7 +201,7 @@ def test_view_saves_the_recordings_that_are_chosen_as_one_file(lab: Lab, own_hom
         file.stem for file in files
     ]
     trial = tacpipe.open("data/r")["trial-002"]
-    t_ns, values = timed(read(Path("cup.rrd"))["/touch/xela1"], "Scalars:scalars")
+    t_ns, values = measure_time(read(Path("cup.rrd"))["/touch/xela1"], "Scalars:scalars")
     assert len(values) == trial.table("xela1").num_rows and (np.diff(t_ns) >= 0).all()
     lab.run("view data/r trial-000 --save cup.rrd")  # its own file is replaced
     assert lab.call("view data/r --save cup.rrd").code == 2  # one file, four recordings

@@ -124,7 +124,7 @@ def test_joints_are_told_apart_by_name_whatever_their_order(tmp_path: Path) -> N
     assert b"unit" not in result["joints_finger"].table.schema.field("joint1_position").metadata
 
 
-def _stamped(stamps_ns: list[int], log_ns: list[int], path: Path) -> SourceStream:
+def _stamp(stamps_ns: list[int], log_ns: list[int], path: Path) -> SourceStream:
     name = "geometry_msgs/msg/WrenchStamped"
     sent: list[Sent] = []
     for index, (stamp, log) in enumerate(zip(stamps_ns, log_ns, strict=True)):
@@ -135,7 +135,7 @@ def _stamped(stamps_ns: list[int], log_ns: list[int], path: Path) -> SourceStrea
 
 
 def test_rows_are_in_the_order_in_which_they_were_measured(tmp_path: Path) -> None:
-    result = _stamped(
+    result = _stamp(
         [START_NS, START_NS + 20, START_NS + 10], [START_NS + 100, START_NS + 110, START_NS + 120], tmp_path / "a"
     )
     assert result.time.column == "t_header_ns"
@@ -146,7 +146,7 @@ def test_rows_are_in_the_order_in_which_they_were_measured(tmp_path: Path) -> No
 def test_header_stamps_that_are_not_set_or_of_another_clock_leave_the_log_time(
     tmp_path: Path, stamps: list[int]
 ) -> None:
-    result = _stamped(stamps, [START_NS, START_NS + 1], tmp_path / "a")
+    result = _stamp(stamps, [START_NS, START_NS + 1], tmp_path / "a")
     assert result.time.column == "t_log_ns"
     assert result.table.schema.field("t_log_ns").metadata[b"clock"] == b"log time"
     if any(stamps):

@@ -50,7 +50,7 @@ def _edited_output(tool: Tool, folder: Path) -> Cell:
     return Cell(f"{note}{outcome}", False)
 
 
-def damaged(harm: Callable[[Path], None]) -> Fault:
+def damage(harm: Callable[[Path], None]) -> Fault:
     """Return the fault of a cached file that is harmed, before the output is brought back and read on."""
 
     def fault(tool: Tool, folder: Path) -> Cell:
@@ -247,9 +247,9 @@ def full(tool: Tool, folder: Path) -> Cell:
 
 FAULTS: Mapping[str, tuple[str, Fault]] = {
     "edited": ("output edited, size and mtime kept; next stage run", edited_output),
-    "flipped": ("a bit flipped in the cache; output brought back", damaged(edit_bit)),
-    "truncated": ("cached file cut in half; output brought back", damaged(truncate)),
-    "deleted": ("cached file deleted; output brought back", damaged(Path.unlink)),
+    "flipped": ("a bit flipped in the cache; output brought back", damage(edit_bit)),
+    "truncated": ("cached file cut in half; output brought back", damage(truncate)),
+    "deleted": ("cached file deleted; output brought back", damage(Path.unlink)),
     "killed": ("`kill -9` at work; run again at once with another factor", killed),
     "interrupted": ("Ctrl-C at work", interrupted),
     "crowd": (f"{CROWD} runs of the same stage at once", crowd),

@@ -62,7 +62,7 @@ def score(
     return alarms.score(truth, ahead, groups, horizon=HORIZON, sd=unit, theta=unit, rate_hz=RATE_HZ, repeated=repeated)
 
 
-def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
+def train(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
     """Evaluate a forecast on fresh recordings, calibrated on others of the same kind."""
 
     def ahead(truth: np.ndarray, groups: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
 
 
 def test_a_forecast_that_knows_the_future_leads_every_event_by_the_whole_horizon() -> None:
-    scored = trained("oracle")
+    scored = train("oracle")
     assert scored.events > 100
     assert scored.recall == 1
     assert scored.median_lead_rows == scored.median_lead_frames == HORIZON
@@ -87,7 +87,7 @@ def test_a_forecast_that_knows_the_future_leads_every_event_by_the_whole_horizon
 
 
 def test_persistence_never_alarms() -> None:
-    scored = trained("persistence")
+    scored = train("persistence")
     assert scored.events > 100
     assert (scored.recall, scored.false_alarms_per_minute) == (0, 0)
     assert math.isnan(scored.median_lead_rows)
@@ -99,7 +99,7 @@ def test_persistence_never_alarms() -> None:
 def test_a_forecast_that_follows_what_has_begun_leads_no_more_events_than_chance(
     forecast: str, lasts: tuple[int, int]
 ) -> None:
-    scored = trained(forecast, lasts)
+    scored = train(forecast, lasts)
     assert scored.events > 100
     assert scored.recall < 0.03, scored  # one false alarm a minute falls into the fifth of a second before 1 in 300
 

@@ -224,7 +224,7 @@ def test_hard_contact_that_training_had_not_is_no_raw_counts(forecaster: Forward
     assert np.isfinite(forecaster.predict(window, plan)).all()
 
 
-def published(files: Mapping[str, Path]) -> FakeShard:
+def publish(files: Mapping[str, Path]) -> FakeShard:
     """A published trial after synchronize and segment contacts."""
     ingest, synchronize, contacts = (
         load_stage(name) for name in ("ingest.xela-flat", "synchronize", "segment.contacts")
@@ -241,7 +241,7 @@ def test_raw_counts_of_published_trials_are_always_refused_and_counts_above_rest
     ingest = load_stage("ingest.xela-flat")
     assert ingest.discover is not None
     sources = list(ingest.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
-    training, watched, *remaining = (published(dict(files)) for files in sources if not isinstance(files, Source))
+    training, watched, *remaining = (publish(dict(files)) for files in sources if not isinstance(files, Source))
     asked_for = {"epochs": 1, "stride": 10, "baselines": False}  # trained on one trial, where the limit is least sure
     loaded = ForwardModel.load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))
     refused = 0

@@ -15,12 +15,12 @@ TRACKS = [track(motion(seed, rows=count).content) for seed, count in ((0, 30), (
 STARTS = [recorded.starts(CONTEXT, HORIZON) for recorded in TRACKS]
 
 
-def joined(actions: str = "planned") -> Rows:
+def join_parts(actions: str = "planned") -> Rows:
     return rows_of_tracks(TRACKS, STARTS, CONTEXT, HORIZON, actions=actions)
 
 
 def test_windows_are_rows_of_one_recording_each() -> None:
-    rows = joined()
+    rows = join_parts()
     assert [len(starts) for starts in STARTS] == [22, 0, 12]
     assert rows.part.count == 34
     picked, ahead = rows.pick(rows.starts)
@@ -34,7 +34,7 @@ def test_windows_are_rows_of_one_recording_each() -> None:
 
 
 def test_some_are_spread_evenly_and_no_more_than_asked_for() -> None:
-    rows = joined()
+    rows = join_parts()
     assert torch.equal(rows.evenly_spread(100), rows.starts)
     assert rows.evenly_spread(10).tolist() == rows.starts[::4].tolist()
     assert len(rows.evenly_spread(10)) <= 10
@@ -46,7 +46,7 @@ def test_no_recordings_and_no_windows_make_no_rows() -> None:
 
 
 def test_a_model_is_told_the_plan_that_its_actions_say() -> None:
-    windows = joined().pick(joined().starts)[0]
+    windows = join_parts().pick(join_parts().starts)[0]
     assert with_actions(windows, "planned") is windows
     arm = with_actions(windows, "none").arm
     assert torch.equal(arm[CONTEXT:], arm[CONTEXT - 1].expand(HORIZON, -1, -1))
@@ -60,4 +60,4 @@ def test_a_model_is_told_the_plan_that_its_actions_say() -> None:
 
 def test_actions_that_do_not_exist_are_named_with_those_that_do() -> None:
     with pytest.raises(TacpipeError, match=f"no actions 'guessed'; there are {', '.join(ACTIONS)}"):
-        joined("guessed")
+        join_parts("guessed")

@@ -21,7 +21,7 @@ TACTILE = RNG.normal(size=(30, len(CHANNELS)))
 JOINTED = RNG.normal(size=(60, len(CHANNELS)))
 
 
-def timed(t_ns: np.ndarray) -> pa.Table:
+def measure_time(t_ns: np.ndarray) -> pa.Table:
     content = table(RNG.normal(size=(len(t_ns), len(CHANNELS))))
     return content.set_column(0, content.schema.field(0), [t_ns.astype(np.int64)])
 
@@ -39,7 +39,7 @@ def test_windows_cross_neither_gaps_nor_missing_rows_and_contact_does_not_matter
     assert recorded.starts(3, 2).tolist() == [*range(11), *range(16, 26)]
     t_ns = np.arange(30) * 20_000_000
     t_ns[12:] += 60_000_000
-    assert track(timed(t_ns)).starts(5, 5).tolist() == [0, 1, 2, *range(12, 21)]
+    assert track(measure_time(t_ns)).starts(5, 5).tolist() == [0, 1, 2, *range(12, 21)]
 
 
 def test_windows_in_contact_lie_within_one_contact() -> None:
@@ -157,7 +157,7 @@ def test_a_gap_in_the_joints_leaves_the_other_rows_their_velocities() -> None:
 def test_how_far_apart_rows_may_be_depends_on_their_grid(grid: str, step: float, windows: int) -> None:
     t_ns = np.arange(30.0) * 20e6
     t_ns[12:] += (step - 1) * 20e6
-    assert len(track(timed(t_ns), grid=grid).starts(3, 3)) == windows
+    assert len(track(measure_time(t_ns), grid=grid).starts(3, 3)) == windows
 
 
 def test_ground_truth_is_never_read() -> None:

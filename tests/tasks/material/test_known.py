@@ -26,7 +26,7 @@ def foreign_slides(**attributes: Any) -> Any:
     return dataset(*(slide(sensor, FOREIGN, trial, **attributes) for sensor in SENSORS for trial in range(4)))
 
 
-def joined(known_slides: Any, unknown: Any) -> Any:
+def join_parts(known_slides: Any, unknown: Any) -> Any:
     return dataset(*known_slides.recordings.values(), *unknown.recordings.values())
 
 
@@ -61,7 +61,7 @@ def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_know
     model: dict[str, bytes],
 ) -> None:
     known_tree, _ = evaluated(model, slides(40, 5))
-    tree, result = evaluated(model, joined(slides(40, 5), foreign_slides()))
+    tree, result = evaluated(model, join_parts(slides(40, 5), foreign_slides()))
     assert tree["model"] == known_tree["model"]  # slides of materials that the model does not know are counted apart
     for sensor in SENSORS:
         unknown = tree["unknown"][sensor]
@@ -107,7 +107,7 @@ def test_slides_of_unknown_materials_whose_labels_are_text_are_evaluated_too(tmp
     calibrated = material_calibration.calibrate(
         files, ASKED, with_text_labels(slides(0, 8)), with_text_labels(slides(20, 5))
     )
-    tree, _ = evaluated(calibrated, joined(with_text_labels(slides(40, 2)), with_text_labels(foreign_slides())))
+    tree, _ = evaluated(calibrated, join_parts(with_text_labels(slides(40, 2)), with_text_labels(foreign_slides())))
     assert tree["unknown"]["biotac"]["false_known_n"] == 4
 
 
@@ -120,7 +120,7 @@ def test_a_model_that_is_not_calibrated_has_no_answers_and_refuses_other_materia
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
         material_prediction.predict(plain, slides(40, 1), probabilities=True)
     with pytest.raises(TacpipeError, match="not one of those the model names"):
-        evaluated(plain, joined(slides(40, 1), foreign_slides()))
+        evaluated(plain, join_parts(slides(40, 1), foreign_slides()))
 
 
 def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_network_is_calibrated_as_any_architecture(tmp_path: Path) -> None:
     files = trained(tmp_path, slides(0, 8), slides(20, 5), architecture="x-lstm", scaling="standard")
     tree, _ = evaluated(
         material_calibration.calibrate(files, ASKED, slides(0, 8), slides(20, 5)),
-        joined(slides(40, 2), foreign_slides()),
+        join_parts(slides(40, 2), foreign_slides()),
     )
     assert set(tree["calibration"]) == set(SENSORS)
 

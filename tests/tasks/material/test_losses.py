@@ -17,7 +17,7 @@ CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": AutoencoderShape(4, 3, hidden=6, latents=5), "b": AutoencoderShape(7, 3, hidden=6, latents=5)}
 
 
-def touched(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
+def touch(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
     generator = torch.Generator().manual_seed(len(sensor) + SHAPES[sensor].channels)
     return ScaledSlides(torch.randn(len(classes), 9, SHAPES[sensor].channels, generator=generator), classes)
 
@@ -29,7 +29,7 @@ def networks(architecture: str = "raec") -> nn.ModuleDict:
 
 
 def work(weights: Weights, frozen: str = "", **classes: Tensor) -> JointWork:
-    slides_by_sensor = {name: touched(name, classes.get(name, CLASSES)) for name in SHAPES}
+    slides_by_sensor = {name: touch(name, classes.get(name, CLASSES)) for name in SHAPES}
     pairs = BatchPairs({name: sensor_slides.classes for name, sensor_slides in slides_by_sensor.items()}, 16)
     return JointWork(slides_by_sensor, slides_by_sensor, pairs, weights, frozen)
 

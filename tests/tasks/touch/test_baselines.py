@@ -18,31 +18,31 @@ def baselines(objects: tuple[str, ...] = ("ball", "ball", "egg", "")) -> Baselin
     return Baselines(FELT, objects, np.array([0, 100, 200, 900], np.int64))
 
 
-def asked(objects: tuple[str, ...], t_ns: tuple[int, ...]) -> Grasps:
+def ask(objects: tuple[str, ...], t_ns: tuple[int, ...]) -> Grasps:
     batch = grasps(0, len(objects), kinds=["ball"])
     return dataclasses.replace(batch, objects=objects, t_ns=np.array(t_ns, np.int64))
 
 
 def test_the_constant_is_the_mean_of_all_training_grasps() -> None:
-    predicted = baselines().predict(asked(("ball", "drill"), (0, 5)))["constant"]
+    predicted = baselines().predict(ask(("ball", "drill"), (0, 5)))["constant"]
     assert predicted["pdc_th"].tolist() == [[40.0], [40.0]]
     assert predicted["e_th"].tolist() == [list(np.arange(24) + 36.0)] * 2
 
 
 def test_the_object_mean_is_that_of_the_same_object_and_the_constant_for_others() -> None:
-    predicted = baselines().predict(asked(("egg", "ball", "drill", ""), (0, 0, 0, 0)))["object_mean"]
+    predicted = baselines().predict(ask(("egg", "ball", "drill", ""), (0, 0, 0, 0)))["object_mean"]
     assert predicted["pdc_th"].tolist() == [[40.0], [15.0], [40.0], [40.0]]
     assert predicted["e_th"][1].tolist() == list(np.arange(24) + 12.0)
 
 
 def test_the_nearest_in_time_are_three_whatever_their_object() -> None:
-    predicted = baselines().predict(asked(("drill",) * 3, (90, 1000, 10**18)))["nearest_in_time"]
+    predicted = baselines().predict(ask(("drill",) * 3, (90, 1000, 10**18)))["nearest_in_time"]
     assert predicted["pdc_th"].tolist() == [[(10 + 20 + 40) / 3], [(20 + 40 + 90) / 3], [(20 + 40 + 90) / 3]]
 
 
 def test_of_fewer_than_three_training_grasps_all_are_nearest() -> None:
     two = Baselines({"pdc_th": FELT["pdc_th"][:2]}, ("a", "b"), np.array([0, 1], np.int64))
-    assert two.predict(asked(("a",), (7,)))["nearest_in_time"]["pdc_th"].tolist() == [[15.0]]
+    assert two.predict(ask(("a",), (7,)))["nearest_in_time"]["pdc_th"].tolist() == [[15.0]]
 
 
 def test_tensors_and_their_bytes_give_back_the_baselines() -> None:

@@ -24,7 +24,7 @@ QUANTILES = {
 }
 
 
-def calibrated(**options: Any) -> Any:
+def calibrate(**options: Any) -> Any:
     """A result with quantiles of recordings whose objects are known and unseen, and one of a recording that was seen."""
     plain = result("raw", **options)
     rows = [
@@ -52,7 +52,7 @@ def uncertainty(*results: Any) -> list[Fold]:
 
 
 def test_coverage_and_pinball_loss_are_pooled_over_recordings_that_were_not_seen() -> None:
-    (fold,) = uncertainty(calibrated(), calibrated(seed=1))
+    (fold,) = uncertainty(calibrate(), calibrate(seed=1))
     (table,) = [block for block in fold.blocks if isinstance(block, Table)]
     rows = [[getattr(cell, "text", cell) for cell in row.cells] for group in table.groups for row in group.rows]
     assert rows[0] == ["known objects: quantiles of the model", "t+1", "2", "0.8", "2", "0.4", "20"]
@@ -60,7 +60,7 @@ def test_coverage_and_pinball_loss_are_pooled_over_recordings_that_were_not_seen
 
 
 def test_coverage_is_drawn_by_step_and_a_forecast_with_its_band() -> None:
-    (fold,) = uncertainty(calibrated())
+    (fold,) = uncertainty(calibrate())
     titles = [chart.title for block in fold.blocks if isinstance(block, Charts) for chart in block.charts]
     assert titles == ["Coverage: known objects", "Coverage: unseen objects", "r1: xela1_taxel01_z"]
 
@@ -70,7 +70,7 @@ def test_results_without_quantiles_have_no_such_part() -> None:
 
 
 def test_a_model_that_was_evaluated_before_and_after_its_calibration_counts_once() -> None:
-    plain, with_quantiles = result("raw"), calibrated()
+    plain, with_quantiles = result("raw"), calibrate()
     config = {**json.loads(with_quantiles.files["config.json"]), "quantiles": {}, "trained_on": {"r9": "00"}}
     copy = FakeDataset(
         with_quantiles.recordings,

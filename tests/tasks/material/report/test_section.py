@@ -21,7 +21,7 @@ BOTH = {"biotac": 1, "roboskin": 2}
 PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
 
 
-def grouped(*results: Any) -> list[Method]:
+def group(*results: Any) -> list[Method]:
     return parts.methods("material", *results)
 
 
@@ -124,7 +124,7 @@ def test_a_result_without_unseen_slides_is_reported_as_its_metrics_name_it() -> 
 
 
 def test_confusions_are_counted_over_runs_and_stated_in_words() -> None:
-    (method,) = grouped(result(wrong={"biotac": 2}, fold=0), result(wrong={"biotac": 1}, fold=1))
+    (method,) = group(result(wrong={"biotac": 2}, fold=0), result(wrong={"biotac": 1}, fold=1))
     counts, materials = figures.count_confusions(method, "biotac")
     assert materials == [1, 2, 3, 4]
     # the fakes take the first slide of material 1 for 2 in both runs, and that of 2 for 3 in one
@@ -174,7 +174,7 @@ def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
 def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alone() -> None:
     drawn = parts.charts(
         figures.latent_folds(
-            grouped(
+            group(
                 result(wrong=BOTH, joint=True, epochs=2),
                 result(wrong=BOTH, joint=True, epochs=2, partners=PARTNERS, pairing="permuted"),
                 result(wrong={"biotac": 1}, epochs=2),
@@ -188,11 +188,11 @@ def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alo
     assert {row["shape"] for row in parts.values(drawn[0])} == {"BioTac", "RoboSkin"}
     lines = drawn[1].spec["layer"][-1]["data"]["values"]
     assert [item["text"] for item in lines] == ["1", "2", "3", "4"]
-    assert figures.latent_folds(grouped(result("minirocket", wrong=BOTH))) == []
+    assert figures.latent_folds(group(result("minirocket", wrong=BOTH))) == []
 
 
 def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control() -> None:
-    results = grouped(
+    results = group(
         result(wrong=BOTH, joint=True, epochs=4, fold=0),
         result(wrong=BOTH, joint=True, epochs=5, fold=1),
         result(wrong=BOTH, joint=True, epochs=4, pairing="permuted"),
@@ -209,14 +209,14 @@ def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control
     ]  # the mean last
     (pairs,) = figures.alignment_charts(results)
     assert {row["name"] for row in parts.values(pairs)} == {"RAEC joint", "RAEC joint · permuted pairs"}
-    assert figures.validation_charts(grouped(result("minirocket", wrong=BOTH))) == []
-    assert figures.alignment_charts(grouped(result(wrong=BOTH, epochs=3))) == []
+    assert figures.validation_charts(group(result("minirocket", wrong=BOTH))) == []
+    assert figures.alignment_charts(group(result(wrong=BOTH, epochs=3))) == []
 
 
 def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
     drawn = parts.charts(
         figures.few_slides_folds(
-            grouped(
+            group(
                 *(result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, count)) for count in (64, 576)),
                 *(result(wrong=BOTH, joint=True, reduce="biotac", ratio=ratio, shuffle=False) for ratio in (11, 50)),
                 *(result(wrong=BOTH, joint=True, train={"biotac": 576, "roboskin": count}) for count in (96, 576)),
@@ -228,7 +228,7 @@ def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
     names = [{row["name"] for row in parts.values(item)} for item in drawn]
     assert names == [{"MiniRocket", f"{joint} · fixed batches"}, {"MiniRocket", joint}]
     assert {row["x"] for row in parts.values(drawn[0]) if row["name"] == "MiniRocket"} == {64, 576}
-    assert figures.few_slides_folds(grouped(result("minirocket", wrong=BOTH))) == []
+    assert figures.few_slides_folds(group(result("minirocket", wrong=BOTH))) == []
 
 
 def test_slides_are_counted_and_the_one_of_median_force_is_drawn() -> None:

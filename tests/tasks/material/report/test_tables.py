@@ -16,7 +16,7 @@ BOTH = {"biotac": 1, "roboskin": 2}
 LEVEL = {"mean_level": {"biotac": 4, "roboskin": 8}, "permuted_labels": {"biotac": 15, "roboskin": 20}}
 
 
-def grouped(*results: Any) -> list[Method]:
+def group(*results: Any) -> list[Method]:
     return parts.methods("material", *results)
 
 
@@ -65,7 +65,7 @@ def test_controls_and_fewer_slides_do_not_compete() -> None:
 
 def test_table_2_tells_what_exchanging_classifiers_costs() -> None:
     tables = swap_table(
-        grouped(
+        group(
             result(wrong=BOTH, joint=True, also={"swapped": {"biotac": 3, "roboskin": 2}}),
             result(wrong=BOTH, joint=True, pairing="permuted", also={"swapped": {"biotac": 2, "roboskin": 1}}),
             result("minirocket", wrong=BOTH),
@@ -77,12 +77,12 @@ def test_table_2_tells_what_exchanging_classifiers_costs() -> None:
     assert parts.cells(tables, "RAEC joint · permuted pairs")[5] == "+5.0"
     assert parts.cells(tables, "paper: RAEC joint") == ["96.01", "95.31", "−0.7", "93.23", "93.23", "+0.0", "–"]
     assert "MiniRocket" not in parts.words([tables])
-    assert swap_table(grouped(result("minirocket", wrong=BOTH))) is None
+    assert swap_table(group(result("minirocket", wrong=BOTH))) is None
 
 
 def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides() -> None:
     tables = reduction_tables(
-        grouped(
+        group(
             result(wrong=BOTH, joint=True, reduce="roboskin", ratio=11, shuffle=False),
             result(wrong={"roboskin": 10}, reduce="roboskin", ratio=11, shuffle=False),
             result("minirocket", wrong={"roboskin": 5}),
@@ -94,7 +94,7 @@ def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides(
     assert row[0] == "64"
     assert [cell[:5].strip() for cell in row[1:]] == ["95.0", "96.88", "90.0", "45.31", "50.0", "46.35", "70.0"]
     assert parts.cells(tables, "50 %") == ["288", "–", "96.88", "–", "86.98", "–", "82.29", "–"]
-    assert reduction_tables(grouped(result(wrong=BOTH, joint=True))) == []
+    assert reduction_tables(group(result(wrong=BOTH, joint=True))) == []
 
 
 def test_heads_of_tables_3_and_4_state_epochs_that_are_fewer_than_the_papers() -> None:
@@ -102,19 +102,19 @@ def test_heads_of_tables_3_and_4_state_epochs_that_are_fewer_than_the_papers() -
     config = json.loads(dataset.files["config.json"])
     config["params"]["epochs"] = 150
     dataset.files["config.json"] = json.dumps(config).encode()
-    (short,) = reduction_tables(grouped(dataset))
+    (short,) = reduction_tables(group(dataset))
     assert [head for head in short.heads if "150 of 2,000 epochs" in head] == [
         "joint (150 of 2,000 epochs), BioTac",
         "joint (150 of 2,000 epochs), RoboSkin",
     ]
-    (full,) = reduction_tables(grouped(result(wrong=BOTH, joint=True, reduce="roboskin", ratio=11, shuffle=False)))
+    (full,) = reduction_tables(group(result(wrong=BOTH, joint=True, reduce="roboskin", ratio=11, shuffle=False)))
     assert "epochs" not in " ".join(full.heads)
 
 
 def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_from_fewer_batches() -> None:
     fewer = {"biotac": 96, "roboskin": 576}
     tables = reduction_tables(
-        grouped(
+        group(
             result(wrong=BOTH, joint=True),
             result(wrong={"biotac": 4, "roboskin": 2}, joint=True, train=fewer),
             result(wrong={"biotac": 6}, train={"biotac": 96}),
@@ -137,7 +137,7 @@ def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_f
 
 def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
     tables = difference_table(
-        grouped(
+        group(
             *(result(wrong={"biotac": wrong}, joint=True, fold=wrong) for wrong in (1, 2)),
             *(result(wrong={"biotac": 6}, fold=fold) for fold in (1, 2)),
         )
@@ -148,7 +148,7 @@ def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
     # slides that one of two joint runs names right count as right, and the five others only the joint one does
     assert row[1:4] == ["20", "5 : 0", "0.062"]
     assert row[5] == "2 folds"
-    assert difference_table(grouped(result("minirocket", wrong=BOTH))) is None
+    assert difference_table(group(result("minirocket", wrong=BOTH))) is None
 
 
 def test_every_run_is_listed() -> None:
@@ -182,11 +182,11 @@ def test_held_out_materials_are_told_out_of_all_and_out_of_themselves() -> None:
         )
         for seed in (0, 1)
     ]
-    tables = parts.tables(zero_shot_folds(grouped(*results)))
+    tables = parts.tables(zero_shot_folds(group(*results)))
     name = "RAEC joint · RoboSkin without 3, 4"
     assert parts.cells(tables, f"{name}, out of all")[1].startswith("20.0 ± 0.0 | 16/80")
     assert parts.cells(tables, f"{name}, out of all")[2:] == ["5.0", "2"]
     low, high = wilson(0, 2)  # two materials, each once however many runs there are, a fifth of which is right
     assert parts.cells(tables, f"{name}, out of all")[1].endswith(f"· {100 * low:.1f} to {100 * high:.1f}")
     assert parts.cells(tables, f"{name}, out of those held out")[1].startswith("50.0 ± 0.0 | 40/80")
-    assert zero_shot_folds(grouped(result(wrong=BOTH))) == []
+    assert zero_shot_folds(group(result(wrong=BOTH))) == []

@@ -42,7 +42,7 @@ def rows(seed: int = 0) -> pd.DataFrame:
     return pd.DataFrame(values)
 
 
-def calibrated(seed: int = 0, **options: Any) -> Any:
+def calibrate(seed: int = 0, **options: Any) -> Any:
     base = result(novel=OBJECTS[2:], seed=seed, **options)
     config = {**json.loads(base.files["config.json"]), "quantiles": {"levels": [10, 50, 90]}}
     file = io.BytesIO()
@@ -78,7 +78,7 @@ def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() 
 
 
 def test_the_part_has_coverage_by_target_a_table_and_the_electrodes_of_known_and_novel_objects() -> None:
-    (uncertainty_fold,) = folds(calibrated(), calibrated(1))
+    (uncertainty_fold,) = folds(calibrate(), calibrate(1))
     titles = [chart.title for block in uncertainty_fold.blocks if isinstance(block, Charts) for chart in block.charts]
     assert titles == [
         "Coverage: known objects", "Coverage: novel objects",
@@ -92,7 +92,7 @@ def test_the_part_has_coverage_by_target_a_table_and_the_electrodes_of_known_and
 
 
 def test_an_electrode_whose_band_holds_nothing_is_drawn_so() -> None:
-    (uncertainty_fold,) = folds(calibrated())
+    (uncertainty_fold,) = folds(calibrate())
     *_, electrodes = [block for block in uncertainty_fold.blocks if isinstance(block, Charts)]
     for chart in electrodes.charts:
         drawn = {(mark["panel"], mark["Electrode"]): mark for mark in chart.spec["data"]["values"]}
