@@ -1,4 +1,4 @@
-"""Commands of tacpipe run one after another in one new process, which imports what they need once."""
+"""Run several tacpipe commands in one new process, which imports everything only once."""
 
 from __future__ import annotations
 

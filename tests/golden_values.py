@@ -1,4 +1,4 @@
-"""The values that each deterministic stage gives on simulated recordings, as digests: `python -m tests.golden_values`."""
+"""Digests of the values of each deterministic stage on simulated recordings: `python -m tests.golden_values`."""
 
 from __future__ import annotations
 

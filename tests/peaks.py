@@ -1,4 +1,4 @@
-"""The peak of resident memory of a command, in a process of its own."""
+"""Measure the peak resident memory of a command in a separate process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a camera over a tilted table, on which a ball that was grasped and a box lie; made up of rays."""
+"""Ray-traced camera views of a tilted table with a grasped ball and a box."""
 
 from __future__ import annotations
 

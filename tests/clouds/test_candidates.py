@@ -1,4 +1,4 @@
-"""Candidates on bodies whose antipodal pairs are known by hand, and beside the grasps that were made."""
+"""Test candidates on bodies with known antipodal pairs, and against published grasps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds: what is refused, and that a table gives back what it was made of."""
+"""Test that invalid clouds are rejected, and that tables restore clouds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grasps: what is refused, tables and back, and the laws of swapping and moving."""
+"""Test that invalid grasps are rejected, tables restore grasps, and swapping and moving obey their laws."""
 
 from __future__ import annotations
 

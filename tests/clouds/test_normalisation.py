@@ -1,4 +1,4 @@
-"""Normalised clouds: their bounds, their units, and what a turn does to them."""
+"""Test the bounds and units of normalised clouds, and the effect of a rotation."""
 
 from __future__ import annotations
 

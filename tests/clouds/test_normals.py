@@ -1,4 +1,4 @@
-"""Normals against those of the bodies that the points lie on."""
+"""Compare normals with those of known bodies."""
 
 from __future__ import annotations
 

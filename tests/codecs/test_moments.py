@@ -1,4 +1,4 @@
-"""Moments of rows that come in pieces are those that numpy gives of all rows."""
+"""Compare the moments of chunks of rows with those that numpy computes from all rows."""
 
 from __future__ import annotations
 

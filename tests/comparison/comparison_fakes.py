@@ -1,4 +1,4 @@
-"""Runs made by hand, of which all that a comparison states can be computed otherwise."""
+"""Handmade runs, for which all results of a comparison can be computed independently."""
 
 from __future__ import annotations
 

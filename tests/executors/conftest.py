@@ -1,4 +1,4 @@
-"""A scheduler and workers of Dask, in processes of their own: as threads of this one they would disturb other tests."""
+"""A Dask scheduler and workers in separate processes, because threads of this process would disturb other tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slurm on one computer, with its own key and folders: as Debian's package slurm-wlm brings it, started for tests."""
+"""Slurm on one computer, with its own key and folders, from Debian's package slurm-wlm, started for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers of Dask: who may be reached, what they must have, and what is left where one of them ends."""
+"""Test Dask workers: connection, required versions, and recovery after a worker dies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers, scheduler and command that end at any moment: what is there then is right, and the same command completes it."""
+"""Test that workers, scheduler and command may end at any moment, and that the same command then completes the result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The estimate that is printed before a grid: of what is missing, and without a trace of what was timed."""
+"""Test the estimate before a grid: it covers missing trainings and leaves no trace of the timed one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every executor gives the same datasets, errors and exit codes."""
+"""Test that every executor gives the same datasets, errors and exit codes."""
 
 from __future__ import annotations
 

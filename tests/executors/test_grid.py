@@ -1,4 +1,4 @@
-"""One command for several folds: what each alone would give, at a place of its own."""
+"""Test that one command for several folds gives the results of single folds, each in its own folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs of Slurm: what is submitted, what a job that cannot work says, and that none is left behind."""
+"""Test Slurm jobs: their submission, the error of a job that cannot work, and that no job is left behind."""
 
 from __future__ import annotations
 

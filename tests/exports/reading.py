@@ -1,6 +1,6 @@
-"""What runs in the environment of `tests.exports.environment`: opens exports with other tools and prints what these give.
+"""Open exports with other tools in the environment of `tests.exports.environment`, and print their content.
 
-It imports nothing of tacpipe.
+This module does not import tacpipe.
 """
 
 from __future__ import annotations

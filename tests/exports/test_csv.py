@@ -1,4 +1,4 @@
-"""Recordings as CSV: what `ingest table` reads back is what was written, to the bit."""
+"""Test that `ingest table` restores exported CSV files bit for bit."""
 
 from __future__ import annotations
 

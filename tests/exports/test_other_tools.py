@@ -1,6 +1,6 @@
-"""LeRobot's own loader, `datasets` and `mlcroissant` open what was exported, offline, and give values and names back.
+"""Test that LeRobot's own loader, `datasets` and `mlcroissant` open exports offline and return values and names.
 
-They need an environment of their own: `make test-exports` makes it and runs these tests.
+They need a separate environment: `make test-exports` creates it and runs these tests.
 """
 
 from __future__ import annotations

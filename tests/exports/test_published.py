@@ -1,4 +1,4 @@
-"""Each published set is exported in each format that can hold it, and read back by the other side."""
+"""Export each published set in each format that supports it, and read it back with other tools."""
 
 from __future__ import annotations
 

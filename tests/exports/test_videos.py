@@ -1,4 +1,4 @@
-"""Streams of frames in exports: what viewers decode is what was recorded, and packets come back bit for bit."""
+"""Test that exported videos decode to the recorded frames, and that packets are restored bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A container of the tests' own: a JSON file of streams, as a format would give them."""
+"""A container format for tests: a JSON file of streams."""
 
 from __future__ import annotations
 

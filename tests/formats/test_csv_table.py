@@ -1,4 +1,4 @@
-"""The strict CSV reader: what it gives, and how it names what is wrong."""
+"""Test the results and the errors of the strict CSV reader."""
 
 from __future__ import annotations
 

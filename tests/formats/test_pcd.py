@@ -1,4 +1,4 @@
-"""PCD files: what open3d writes is read, what we lay out open3d reads, and what is none is refused."""
+"""Test that PCD files of open3d are read, that open3d reads ours, and that invalid files are rejected."""
 
 from __future__ import annotations
 

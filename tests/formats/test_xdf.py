@@ -1,4 +1,4 @@
-"""XDF files, written by hand from the specification, are read as they are, and as far as they go."""
+"""Test that handmade XDF files are read according to the specification, up to damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An outlet of LSL in a process of its own, made with pylsl: it sends 200 samples a second until its input ends.
+"""An LSL outlet in a separate process, made with pylsl, which sends 200 samples per second until its input ends.
 
 Usage: python lsl_outlet.py KIND NAME FIRST
 """

@@ -1,4 +1,4 @@
-"""A depth camera gives one image an entry; where none is connected, a sentence says so."""
+"""Test that a depth camera returns one image per entry, and that a missing one raises an error."""
 
 from __future__ import annotations
 

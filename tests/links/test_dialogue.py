@@ -1,4 +1,4 @@
-"""A dialogue is carried out, and what came meanwhile is not lost."""
+"""Test that a dialogue is executed, and that data that arrive meanwhile are not lost."""
 
 from __future__ import annotations
 

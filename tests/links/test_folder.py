@@ -1,4 +1,4 @@
-"""A watched folder gives each file once, when it is whole, and never a part of one."""
+"""Test that a watched folder returns each file once, when it is complete."""
 
 from __future__ import annotations
 

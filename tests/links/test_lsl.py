@@ -1,4 +1,4 @@
-"""A stream of LSL, whose outlet runs in another process: what was sent came, with its stamps and as it is described."""
+"""Test that samples, timestamps and description of an LSL stream of another process arrive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images by HTTP: however the bytes are cut, the images are those that were served, and what is no stream is refused."""
+"""Test that images by HTTP are independent of how bytes are divided, and that invalid streams are rejected."""
 
 from __future__ import annotations
 

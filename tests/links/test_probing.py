@@ -1,4 +1,4 @@
-"""A port is asked what speaks on it: by listening at the likely rates, and only then by the drivers' own questions."""
+"""Test that a port is probed first by listening at likely rates, and then by the requests of drivers."""
 
 from __future__ import annotations
 

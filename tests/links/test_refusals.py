@@ -1,4 +1,4 @@
-"""A link that cannot be opened is refused in one sentence: which device, what is wrong, what to do."""
+"""Test that a link that cannot be opened raises one sentence with the device, the fault and a remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serial ports open for one program alone, as the sensor wants them, and say in a sentence why they do not."""
+"""Test that serial ports are opened exclusively, with the sensor's settings, and that errors explain failures."""
 
 from __future__ import annotations
 

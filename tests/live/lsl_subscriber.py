@@ -1,4 +1,4 @@
-"""Messages published by LSL in this process and read by pylsl's own inlet: prints what it got as JSON."""
+"""Publish messages by LSL in this process, read them with pylsl's own inlet, and print them as JSON."""
 
 from __future__ import annotations
 

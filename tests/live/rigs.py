@@ -1,4 +1,4 @@
-"""A small rig of two sensors and an arm, as it is recorded, and models behind the chain of stages."""
+"""The recording of a small rig with two sensors and an arm, and models with preprocessing stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Live sessions with a process each, what subscribers of them hear, and what was recorded."""
+"""Live sessions in separate processes, with the messages of subscribers and the recordings."""
 
 from __future__ import annotations
 

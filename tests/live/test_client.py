@@ -1,4 +1,4 @@
-"""The client of the page on live sessions does what the page states."""
+"""Test that the client on the page about live sessions works as described."""
 
 from __future__ import annotations
 

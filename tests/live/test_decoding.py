@@ -1,4 +1,4 @@
-"""One stream of a live session: what is decoded when a row waits for it, and what can wait until after."""
+"""Test which chunks of a live stream are decoded before a due row, and which can wait."""
 
 from __future__ import annotations
 

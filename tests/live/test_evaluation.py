@@ -1,4 +1,4 @@
-"""`tacpipe evaluate --live`: what a session published, next to the offline chain on the same recording."""
+"""Test `tacpipe evaluate --live`, which compares a session's messages with the offline chain on the same recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The material of a slide while it lasts is what the samples so far give, and at its end what `tacpipe predict` gives."""
+"""Test that live materials are those of the samples so far, and finally those of `tacpipe predict`."""
 
 from __future__ import annotations
 

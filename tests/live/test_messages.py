@@ -1,4 +1,4 @@
-"""Published messages hold the predictions, in every format."""
+"""Test that published messages contain the predictions, in every format."""
 
 from __future__ import annotations
 

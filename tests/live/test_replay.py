@@ -1,4 +1,4 @@
-"""`tacpipe predict --causal` gives what a live session published, and reads nothing that had not arrived."""
+"""Test that `tacpipe predict --causal` reproduces the messages of a live session and reads no later sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Live sessions with real processes and emulated devices: what fails costs forecasts, and never a sample."""
+"""Test live sessions with real processes and emulated devices: failures cost forecasts, never samples."""
 
 from __future__ import annotations
 

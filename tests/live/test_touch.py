@@ -1,4 +1,4 @@
-"""Candidate grasps are ranked by the touch that `tacpipe predict` gives each of them, as a stated criterion has it."""
+"""Test that candidate grasps are ranked by the predictions of `tacpipe predict` and a criterion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A live session of a model of touch: requests come by UDP, rankings leave, and both are recorded."""
+"""Test a live session of a touch model: requests and rankings by UDP, both recorded."""
 
 from __future__ import annotations
 

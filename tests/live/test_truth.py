@@ -1,4 +1,4 @@
-"""Published values against those that came true: rows, times and errors, compared with values by hand."""
+"""Compare published values with the later measurements: rows, times and errors, computed by hand."""
 
 from __future__ import annotations
 

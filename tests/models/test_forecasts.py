@@ -1,4 +1,4 @@
-"""All forecasters alike: they begin at persistence, do not look ahead, and say what they cannot read."""
+"""Test that all forecasters start at persistence, do not look ahead, and reject what they cannot read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mean-level baseline, against scikit-learn, and blind to what it must not see."""
+"""Test the mean-level baseline against scikit-learn, and that it ignores all other information."""
 
 from __future__ import annotations
 

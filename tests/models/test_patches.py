@@ -1,4 +1,4 @@
-"""Networks of patches: what they do not see, and neighbours against a tree's."""
+"""Test the invariances of patch networks, and their neighbours against a k-d tree."""
 
 from __future__ import annotations
 

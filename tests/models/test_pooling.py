@@ -1,4 +1,4 @@
-"""Layers of points against torch's own: a linear layer, batch normalisation, and the largest value over points."""
+"""Compare the layers for points with torch's own: a linear layer, batch normalisation, and the maximum over points."""
 
 from __future__ import annotations
 

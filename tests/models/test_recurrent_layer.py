@@ -1,4 +1,4 @@
-"""Recurrent layers where fewer digits were asked for; that a GPU would take float16 is stated in place of one."""
+"""Test that recurrent layers use float32 under reduced precision, with a simulated GPU."""
 
 from __future__ import annotations
 

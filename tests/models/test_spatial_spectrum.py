@@ -1,4 +1,4 @@
-"""Spectra over spatial frequency: what counts is how long waves of the surface are, not who feels them how."""
+"""Test that spectra over spatial frequency depend on the surface, not on the sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statistics of slides are those that numpy gives by hand, and classify what differs in them."""
+"""Compare the statistics of slides with numpy's, and test their classifier."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One thread for torch and numpy, and as many as before afterwards."""
+"""Test that torch and numpy use one thread in a block, and the previous number afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loss of power on real file systems, replayed block by block: `make test-power` runs this, which takes minutes."""
+"""Replay power failures on real file systems block by block: `make test-power` runs this, which takes minutes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much was tried, and what came of it: counted by tests in any process, summed up for a page.
+"""Count the trials and their outcomes in tests of any process, and sum them up for a page.
 
 python -m tests.promises.counts COUNTS [--write docs/benchmarks/faults.md]
 """

@@ -1,4 +1,4 @@
-"""Cut what comes over a link into frames and decode it as a recording does, however it is cut into chunks."""
+"""Frame and decode the bytes of a link as a recording does, however they are divided into chunks."""
 
 from __future__ import annotations
 

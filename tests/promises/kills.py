@@ -1,4 +1,4 @@
-"""Commands that are killed, interrupted or stopped at random moments, and what they leave behind.
+"""Kill, interrupt or stop commands at random moments, and check what remains.
 
     python -m tests.promises.kills [--trials 10]
 

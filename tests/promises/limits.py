@@ -1,4 +1,4 @@
-"""Tests within bounds: what takes too much memory or never ends is a failed test, and not a dead computer."""
+"""Limit memory and duration of tests, so that an excessive test fails instead of blocking the computer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every stage and every command that touches a store, on data so small that a run takes milliseconds."""
+"""Every stage and every command that uses a store, with data so small that a run takes milliseconds."""
 
 from __future__ import annotations
 

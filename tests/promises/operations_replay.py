@@ -1,4 +1,4 @@
-"""Stages whose result is known give it again, after the same reads and checkpoints: trials then cost what files cost."""
+"""Replay stages with known results, after the same reads and checkpoints, so that trials cost only file operations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Note at each call of an undisturbed run what a kill or a loss of power would leave there."""
+"""Record for each call of an undisturbed run what a kill or a power failure would leave."""
 
 from __future__ import annotations
 

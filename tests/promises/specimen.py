@@ -1,4 +1,4 @@
-"""A project in which all is there that a store can hold, what it held when it was sound, and ways to look at it since."""
+"""A project with all kinds of content of a store, its sound content, and methods to inspect it later."""
 
 from __future__ import annotations
 

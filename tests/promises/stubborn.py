@@ -1,4 +1,4 @@
-"""Stages that do not end when they are asked to: a plug-in of a third party, copied to where tests install it."""
+"""Stages of a third-party plug-in that ignore requests to end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage of any kind to any file of a project: never served, named, and healed where that is possible."""
+"""Test that damage to any file of a project is never served, is reported, and is repaired if possible."""
 
 from __future__ import annotations
 

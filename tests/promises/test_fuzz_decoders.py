@@ -1,4 +1,4 @@
-"""Whatever a link gives, a decoder goes on: it raises nothing, holds little back, and how bytes are cut changes nothing."""
+"""Test decoders with arbitrary bytes: they never raise, buffer little, and do not depend on the division into chunks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever bytes come, a reader gives values or one sentence: no traceback, no hang, no more memory than there is."""
+"""Test readers with arbitrary bytes: they return values or one sentence, without traceback, hang or excessive memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that claim more than they hold, that hold programs, or that are no files: refused before anything is taken."""
+"""Test that files with false claims, with programs, or of other types are rejected before memory is allocated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model or codec from an untrusted source: JSON and safetensors are looked at first, and nothing else is opened."""
+"""Test untrusted models and codecs: only JSON and safetensors are opened, and they are checked first."""
 
 from __future__ import annotations
 

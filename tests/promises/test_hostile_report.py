@@ -1,4 +1,4 @@
-"""Names and labels are text on the page of results, whatever they hold: nothing of them is run."""
+"""Test that names and labels are text on the results page, and never run."""
 
 from __future__ import annotations
 

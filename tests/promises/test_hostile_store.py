@@ -1,4 +1,4 @@
-"""A store of untrusted content: no command waits for what lies in it, runs out of memory, or reads a file elsewhere."""
+"""Test untrusted stores: no command blocks, runs out of memory, or reads a file elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Any number of files of a project harmed anyhow: nothing wrong is ever read, and all is healed but what no one knows."""
+"""Damage random files of a project: wrong content is never read, and everything that can be recomputed is repaired."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a system call answers, a command ends with a sentence, nothing is damaged, and a rerun gives the same bytes."""
+"""Let system calls fail: a command ends with a sentence, nothing is damaged, and a rerun gives the same bytes."""
 
 from __future__ import annotations
 

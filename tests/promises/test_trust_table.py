@@ -1,4 +1,4 @@
-"""The same faults done to tacpipe, DVC and joblib; tacpipe's column must hold."""
+"""Test that tacpipe withstands the faults that are also applied to DVC and joblib."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras by HTTP: what the server sent is recorded bit for bit, whatever happens to the link or the recorder."""
+"""Test that images of HTTP cameras are recorded bit for bit, whatever happens to the link or the recorder."""
 
 from __future__ import annotations
 

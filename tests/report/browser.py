@@ -1,4 +1,4 @@
-"""Headless Chromium, driven over a pipe with the DevTools protocol: what a page shows once a browser has laid it out."""
+"""Control headless Chromium over a pipe with the DevTools protocol, to inspect a rendered page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages without the library of charts, for tests that read what a page holds: bundling it takes a second."""
+"""Pages without the chart library, for tests of their content, because bundling takes a second."""
 
 import pytest
 

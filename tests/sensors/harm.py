@@ -1,4 +1,4 @@
-"""Faults on the way from a device: what a frame's bytes become, and whether the protocol could have seen it."""
+"""Apply transmission faults to frames, and state whether the protocol could detect them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene and a grasp that came over the wire are cut down as those are that never left the computer."""
+"""Test that acquired scenes and grasps are segmented like those that were never sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same questions to every registered sensor: what it says of itself holds, and no fault makes a sample up."""
+"""Test every registered sensor: its declarations are true, and no fault creates samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FlexiTac frames are read as the package flexitac reads them, and better where marks stand among the taxels."""
+"""Compare FlexiTac frames with the package flexitac, also with marks within the taxels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scans of iCub's skin are put together of CAN frames, and no scan is made of two."""
+"""Test that scans of iCub's skin are assembled from CAN frames, and that scans are never mixed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RSI texts as a controller sends them, and rsipi, whose server takes our answers and whose parser reads our texts."""
+"""Test RSI texts as a controller sends them, and with rsipi as server and as parser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of many texts are those that Python reads one by one, and a text that it would read otherwise is not read."""
+"""Compare numbers parsed from many texts with Python's parser; unusual texts are not parsed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages on rigs describe the sensors as they are, and their examples work as printed."""
+"""Test that the pages on rigs describe the sensors correctly, and that their examples work."""
 
 from __future__ import annotations
 

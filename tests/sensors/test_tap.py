@@ -1,4 +1,4 @@
-"""Records of a program: what they become, what is refused, and a grasp that `segment grasps` takes."""
+"""Test the records of a program: conversion, rejection, and a grasp for `segment grasps`."""
 
 from __future__ import annotations
 

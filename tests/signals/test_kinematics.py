@@ -1,4 +1,4 @@
-"""How the hand moves: against products of elementary motions and against differences of what they give."""
+"""Compare kinematics with products of elementary motions and with finite differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grasps of the simulated table as a dataset in memory, as `tacpipe simulate touch` gives them."""
+"""Grasps of the simulated table as an in-memory dataset, as from `tacpipe simulate touch`."""
 
 from __future__ import annotations
 

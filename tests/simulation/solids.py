@@ -1,4 +1,4 @@
-"""The bodies of the simulated table with equations of their own, as an oracle for rays, normals and curvatures."""
+"""Independent equations of the simulated bodies, as an oracle for rays, normals and curvatures."""
 
 from __future__ import annotations
 

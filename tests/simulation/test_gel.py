@@ -1,4 +1,4 @@
-"""Simulated gels: markers follow the forces of the contact, and `extract markers` measures what was simulated."""
+"""Test that simulated markers follow the contact forces, and that `extract markers` measures them."""
 
 from __future__ import annotations
 

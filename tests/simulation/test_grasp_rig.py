@@ -1,4 +1,4 @@
-"""Simulated grasps: what the camera sees, where fingers go, that all follows from seed and number, and the controls."""
+"""Test simulated grasps: views, finger positions, reproducibility, and controls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated rig against Newton, and against what its counts should show."""
+"""Test the simulated rig against Newton's laws, and against expected counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks, holds and slips of the simulated rig, estimated from its streams, against the ground truth."""
+"""Compare clocks, repeats and slips estimated from the simulated rig's streams with the ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The skin: what it shares out adds up, and what it counts can be read back."""
+"""Test that the forces on taxels add up, and can be computed from counts."""
 
 from __future__ import annotations
 

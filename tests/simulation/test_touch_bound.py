@@ -1,4 +1,4 @@
-"""Bounds of a touch: the expected reading and its least error, against closed forms and brute force."""
+"""Compare the expected reading and its minimum error with closed forms and brute force."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A sensor names materials that only another one was trained on: where both feel the same, and only there.
+"""Test that a sensor recognizes materials that only another sensor was trained on, if both measure the same.
 
-Slides of one material are alike in what is wrong with them, so certainty is counted by materials, not by slides.
+Slides of one material have correlated errors, so certainty is counted by materials, not by slides.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Channels of cameras: the brightness of a gel on a coarse grid, next to what numpy gives of the decoded images."""
+"""Compare channels of cameras, the brightness on a coarse grid, with numpy's on decoded images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test that stages without look-ahead give a cut recording the rows that the whole one has before the cut."""
+"""Test that stages without look-ahead give a truncated recording the same rows as the full one."""
 
 from __future__ import annotations
 

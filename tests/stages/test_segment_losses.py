@@ -1,4 +1,4 @@
-"""`segment losses` marks when a held object leaves the fingers."""
+"""Test that `segment losses` marks when an object leaves the fingers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test stages that work on a store in a bucket, each computer with a folder of its own in front."""
+"""Test stages with a store in a bucket and a local cache per computer."""
 
 import itertools
 import json

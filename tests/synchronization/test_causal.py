@@ -1,4 +1,4 @@
-"""Test that rows made while samples arrive are those that `synchronize` makes of the whole recording."""
+"""Test that rows computed while samples arrive equal those of `synchronize` on the full recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stages of a third party that give something else each time, as none should."""
+"""Third-party stages whose results differ each time, which is not allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults, each done to any tool in the same way; what became of it is looked at, never assumed."""
+"""Faults, each applied to any tool in the same way; their effect is observed, never assumed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The three tools, each set up as its documentation says, behind the same few questions."""
+"""The three tools, each set up as its documentation recommends, with the same few operations."""
 
 from __future__ import annotations
 

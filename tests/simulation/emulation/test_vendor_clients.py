@@ -1,4 +1,4 @@
-"""The vendors' own clients read from the emulator what its ledger says that it sent."""
+"""Test that vendors' clients read from the emulator what its ledger records as sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A websocket whose client is gone when the emulated device takes its leave."""
+"""Test a websocket whose client has disconnected when the emulated device closes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm row by row, and planned motion: as of whole recordings, and by the rules of what is assumed."""
+"""Compare causal rows and planned motion with those of full recordings and with the rules for missing plans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predict from windows and plans in Python: counts to come, or a sentence."""
+"""Test predictions from windows and plans in Python, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tactile channels as they are stored give the same bits above rest as arrays of them, and take half the memory."""
+"""Test that stored tactile channels give the same bits above rest as arrays, in half the memory."""
 
 from __future__ import annotations
 

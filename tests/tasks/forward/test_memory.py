@@ -1,4 +1,4 @@
-"""Limit the memory of an evaluation: the recording as it is stored, and one batch of windows."""
+"""Test that an evaluation needs memory only for the stored recording and one batch of windows."""
 
 from __future__ import annotations
 

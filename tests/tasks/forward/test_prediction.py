@@ -1,4 +1,4 @@
-"""Predictions of recordings as tables: what the forecaster says, at the time when it was known."""
+"""Test that predictions of recordings are tables of the forecaster's results, at the time of prediction."""
 
 from __future__ import annotations
 

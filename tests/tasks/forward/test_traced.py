@@ -1,4 +1,4 @@
-"""A network that is recorded gives the same numbers to the bit; one that cannot be recorded runs as it is."""
+"""Test that a traced network gives bit-identical results, and that others run untraced."""
 
 from __future__ import annotations
 

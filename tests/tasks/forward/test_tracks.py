@@ -1,4 +1,4 @@
-"""A recording as a forecaster reads it: which rows, which columns, how fast the hand moves, and how often rows come."""
+"""Test how a forecaster reads a recording: rows, columns, hand velocity, and rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a model comes about: what it learns from, what it holds, and that the same params give the same bytes."""
+"""Test the training of a model: its data, its files, and reproducibility."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results made by hand, with what the report reads of real ones."""
+"""Handmade results with the parts that the report reads."""
 
 from __future__ import annotations
 
