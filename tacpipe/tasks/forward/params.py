@@ -114,7 +114,7 @@ class Change(ForwardModelParams):
     ``auto`` is taxelwise on raw channels and gru on latents.
     """
 
-    # network; auto: taxelwise for raw channels, gru for latents and for channels that are not grouped by taxel
+    # auto: taxelwise for raw channels with a taxel layout, gru for latents and other channels
     architecture: Literal["auto", "taxelwise", "gru", "lstm", "tcn"] = "auto"
     dropout: Dropout = 0.2  # fraction of units dropped in each training step
     # error that training minimises; auto: absolute, and huber for latents of increments, whose median is often 0
@@ -162,7 +162,7 @@ class Change(ForwardModelParams):
 class Recurrent(ForwardModelParams):
     """Params of the paper's model, which predicts levels, has no dropout and minimises the squared error."""
 
-    # network; recurrent is the paper's architecture
+    # recurrent: the paper's network
     architecture: Literal["recurrent"] = "recurrent"
     PRESETS: ClassVar[Presets] = {
         "paper": {
