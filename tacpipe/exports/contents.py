@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.channels import streams
@@ -214,7 +214,7 @@ class _StreamTotals:
         self.rows += row["rows"]
         self.nan |= row["nan"]
         self.rates_hz += [row["rate_hz"]] if row["rate_hz"] else []
-        if columns != self.columns:
+        if _without_codecs(columns) != _without_codecs(self.columns):
             self.differing.append(recording)
             alike = {(column.name, column.type) for column in columns}
             self.shared = [column for column in self.shared if (column.name, column.type) in alike]
@@ -228,6 +228,11 @@ class _StreamTotals:
         return ExportStream(
             name, self.columns, self.recordings, self.rows, rates_hz, self.differing, shared, self.nan, names
         )
+
+
+def _without_codecs(columns: Sequence[Column]) -> list[Column]:
+    """Return columns without the metadata of packets: codec headers differ between videos of one camera."""
+    return [replace(column, about={}) if column.quantity == "image" else column for column in columns]
 
 
 def contents_from_parts(parts: Dataset) -> Contents:

@@ -186,3 +186,11 @@ def test_zarr_arrays_have_the_nearest_frame_of_each_row(
         (back,) = tacpipe.open("back")
         table = back.table("gel_rgb")
         assert table.column("packet").to_pylist() == [image.tobytes() for image in images]
+
+
+def test_cameras_with_different_codec_headers_are_exported_together(lab: Lab) -> None:
+    videos.write(lab.folder / "a.avi", "mpeg4", COUNT)
+    videos.write(lab.folder / "b.avi", "mjpeg", COUNT)
+    recordings.write(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in "ab"})
+    lab.run(f"{LEROBOT} --no-originals")
+    assert len(list(Path("lr/videos").rglob("*.mp4"))) == 2
