@@ -11,7 +11,12 @@ from typing import Any
 
 FILE = Path(__file__).parent / "golden" / "digests.json"
 DIGITS = {"double": 6, "float": 4}  # Digits relative to a column's largest value: another machine may differ beyond.
-RAW = "simulate touch --raw --trials 2 --seed 7 -o raw"  # `segment grasps` reads it; its values are in those below.
+INPUTS = (  # datasets that further commands read; their values are in those below
+    "simulate touch --raw --trials 2 --seed 7 -o raw",
+    "simulate forward --trials 4 --duration-s 5 --seed 7 --effort 1.15 --robot-rate-hz 50 -o held",
+    "label held 'trial-*' --label slip=true",
+    "split held -o held-split --scheme random --val 0.25 --test 0",
+)
 COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
     "synchronize": "synchronize simulate.forward --rate-hz 50 --values interpolate -o {0}",
@@ -21,9 +26,12 @@ COMMANDS = {
     "segment.slides": "segment slides simulate.material -o {0}",
     "simulate.touch": "simulate touch --trials 2 --seed 7 -o {0}",
     "segment.grasps": "segment grasps raw -o {0}",
+    "segment.losses": "segment losses held --streams xela* -o {0}",
+    "train.slip": "train slip held --split held-split --streams xela* --trees 5 --leaf 5 --no-match-time -o {0}",
     "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
     "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
 }
+PREDICTIONS = {"train.slip": "predict train.slip held --causal -o {0}"}  # the values that a model is pinned by
 
 
 def values_digest(path: Path) -> str:
@@ -55,12 +63,15 @@ def current() -> dict[str, dict[str, Any]]:
 
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / ".tacpipe").mkdir()
-        commands.run(Path(folder), [RAW, *(command.format(name) for name, command in COMMANDS.items())])
+        predictions = [command.format(f"{name}-predicted") for name, command in PREDICTIONS.items()]
+        lines = [*INPUTS, *(command.format(name) for name, command in COMMANDS.items()), *predictions]
+        commands.run(Path(folder), lines)
         digests = {}
         for name in COMMANDS:
             stage = registry.load(name)
+            path = f"{name}-predicted" if name in PREDICTIONS else name
             version = [stage.version] + ([stage.fit.version] if stage.fit else [])
-            digests[name] = {"version": version, "digest": values_digest(Path(folder) / name)}
+            digests[name] = {"version": version, "digest": values_digest(Path(folder) / path)}
     return digests
 
 

@@ -2,8 +2,9 @@
 
 Published as amitparag/Incipient-Slip-Detection. A trial is a folder ``OBJECT/exp_num_N`` with one video per sensor,
 ``camera_0.avi`` and ``camera_2.avi`` (MPEG-4, 25 frames per second, no clock), and an empty file ``slip.txt`` if the
-object slipped. A trial with a slip ends at the slip, so its length reveals the label: compare windows at equal times
-since the start.
+object slipped. The time of the slip is not published. In most trials, the object left the fingers about a second
+before the end, in others much earlier (`tacpipe segment losses`). The length of a trial reveals the label: compare
+windows at equal times since the start.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     """Read published videos of two GelSight Mini, with slip.
 
     Each recording has the streams gel0 and gel2, with one row per frame, and the labels object and slip. A trial with a
-    slip ends at the slip, so the length of a recording reveals the label.
+    slip does not state when the object slipped: `segment losses` finds it. The length of a recording reveals the label.
     """
     from tacpipe.video.files import read_stream, scan
 
