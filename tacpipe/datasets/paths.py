@@ -36,7 +36,7 @@ def shard_path(recording: str, stream: str) -> str:
 
 
 def safe_path(path: str) -> bool:
-    r"""Return whether a path stays within the directory that it is relative to, and every file system takes it.
+    r"""Return whether a path stays within the directory that it is relative to, and is valid on every file system.
 
     >>> [safe_path(path) for path in ("trial-01/xela1.parquet", "../x", "/x", ".git/x", "a//b", "a\nb", "")]
     [True, False, False, False, False, False, False]
@@ -73,10 +73,10 @@ _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz01234567
 
 
 def valid_name(text: str) -> str:
-    r"""Return text as the name of a recording, in Unicode's form NFC, or empty if nothing of it can stand in a name.
+    r"""Convert text to a name of a recording, in Unicode's form NFC; empty if it has no valid characters.
 
-    Of ASCII letters, digits, dots, dashes and underscores are kept, of other characters all that are printable. What is
-    left out becomes a dash. A name of more than 192 bytes is cut and ends in a part of its digest.
+    Valid are ASCII letters, digits, dots, dashes and underscores, and all other printable characters. Invalid
+    characters become a dash. A name of more than 192 bytes is truncated and ends with a part of its digest.
 
     >>> valid_name("cup 1"), valid_name("木"), valid_name("../new\nline"), valid_name(" ")
     ('cup-1', '木', 'new-line', '')

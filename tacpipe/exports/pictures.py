@@ -76,31 +76,31 @@ def parameter_sets(video_format: VideoFormat) -> tuple[bytes, int]:
         return extradata, 0
     units: list[bytes] = []
     if video_format.codec == "h264":
-        place, size_bytes = 5, (extradata[4] & 3) + 1
+        offset, size_bytes = 5, (extradata[4] & 3) + 1
         for mask in (0x1F, 0xFF):  # sequence parameter sets, picture parameter sets
-            count, place = extradata[place] & mask, place + 1
-            place = _read_units(extradata, place, count, units)
+            count, offset = extradata[offset] & mask, offset + 1
+            offset = _read_units(extradata, offset, count, units)
     else:
-        place, size_bytes = 23, (extradata[21] & 3) + 1
+        offset, size_bytes = 23, (extradata[21] & 3) + 1
         for _ in range(extradata[22]):
-            place = _read_units(extradata, place + 3, int.from_bytes(extradata[place + 1 : place + 3]), units)
+            offset = _read_units(extradata, offset + 3, int.from_bytes(extradata[offset + 1 : offset + 3]), units)
     return b"".join(START_CODE + unit for unit in units), size_bytes
 
 
 def with_start_codes(packet: bytes, size_bytes: int) -> bytes:
     """Return a packet whose units have start codes in place of their sizes."""
-    units, place = [], 0
-    while place + size_bytes <= len(packet):
-        stop = place + size_bytes + int.from_bytes(packet[place : place + size_bytes])
-        units.append(START_CODE + packet[place + size_bytes : stop])
-        place = stop
+    units, offset = [], 0
+    while offset + size_bytes <= len(packet):
+        stop = offset + size_bytes + int.from_bytes(packet[offset : offset + size_bytes])
+        units.append(START_CODE + packet[offset + size_bytes : stop])
+        offset = stop
     return b"".join(units)
 
 
-def _read_units(extradata: bytes, place: int, count: int, units: list[bytes]) -> int:
-    """Add ``count`` units with sizes of two bytes to ``units``; return the place after them."""
+def _read_units(extradata: bytes, offset: int, count: int, units: list[bytes]) -> int:
+    """Add ``count`` units with sizes of two bytes to ``units``; return the offset after them."""
     for _ in range(count):
-        stop = place + 2 + int.from_bytes(extradata[place : place + 2])
-        units.append(extradata[place + 2 : stop])
-        place = stop
-    return place
+        stop = offset + 2 + int.from_bytes(extradata[offset : offset + 2])
+        units.append(extradata[offset + 2 : stop])
+        offset = stop
+    return offset
