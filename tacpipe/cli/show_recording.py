@@ -14,7 +14,7 @@ from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.datasets.intervals import all_intervals
 from tacpipe.errors import UsageError
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import format_count
 from tacpipe.plugins.stage import Attribute
@@ -105,7 +105,7 @@ class RecordingOverview:
     events: Sequence[RecordedEvent]
     attributes: Mapping[str, Attribute]
 
-    def to_json(self) -> Json:
+    def to_json(self) -> JsonObject:
         """Return the overview as plain values."""
         return {"kind": "recording", **dataclasses.asdict(self)}
 

@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import UsageError
-from tacpipe.io import config_text, regular
-from tacpipe.plugins.stage import Values
+from tacpipe.io import Json, JsonObject, config_text, regular
 from tacpipe.printable import excerpt, listed, plain
 
 _FIELD = re.compile(r"(?<!\\)\$\{(?P<name>.*?)\}")
 _PART = re.compile(r"[^.\[\]]+")
 
 
-def fill_template(value: Any, values: Values, place: str) -> Any:
+Variables = JsonObject  # values by name, of a chain's file or of its params
+
+
+def fill_template(value: Any, values: Variables, place: str) -> Any:
     """Return ``value`` with each ``${name}`` in its texts replaced; a text that consists only of a name becomes its value.
 
     ``place`` is included in errors. Raises `UsageError` for a name without a value, and for a list or mapping inside a
@@ -45,7 +47,7 @@ def fill_template(value: Any, values: Values, place: str) -> Any:
     return text.replace(r"\${", "${")
 
 
-def expand(definition: Values, values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
+def expand(definition: Json, values: Variables, place: str) -> Iterator[tuple[str, Any, Variables]]:
     """Yield the stages of a definition: the part of the name after ``@``, the template and its values.
 
     A definition without ``foreach`` and ``matrix`` is one stage with an empty part. Raises `UsageError` if ``foreach``
@@ -62,7 +64,7 @@ def expand(definition: Values, values: Values, place: str) -> Iterator[tuple[str
         yield "", definition, values
 
 
-def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Values]]:
+def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Variables]]:
     if isinstance(items, Mapping):
         yield from ((_text(key), {"key": _text(key), "item": item}) for key, item in items.items())
     elif isinstance(items, list):
@@ -72,7 +74,7 @@ def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Values]]:
         raise UsageError(f"{place}: foreach is {excerpt(items)}; it must be a list or a mapping.")
 
 
-def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Values]]:
+def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Variables]]:
     if not isinstance(axes, Mapping) or not all(isinstance(items, list) for items in axes.values()):
         raise UsageError(f"{place}: matrix is {excerpt(axes)}; it must be a mapping of lists.")
     for chosen in product(*(enumerate(items) for items in axes.values())):
@@ -84,14 +86,14 @@ def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Values]]:
         yield "-".join(parts), {axis: item for axis, (_, item) in choice.items()}
 
 
-def _value_text(name: str, values: Values, place: str) -> str:
+def _value_text(name: str, values: Variables, place: str) -> str:
     value = _value(name, values, place)
     if isinstance(value, Mapping | list):
         raise UsageError(f"{place}: ${{{name}}} is {excerpt(value)}, which `tacpipe run` does not put into a text.")
     return _text(value)
 
 
-def _value(name: str, values: Values, place: str) -> Any:
+def _value(name: str, values: Variables, place: str) -> Any:
     value: Any = values
     for part in _PART.findall(name):
         try:
@@ -207,7 +209,7 @@ def _stages(file: Path) -> Iterator[ChainStage]:
             yield _stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
 
 
-def _check(content: Values, schema: Values, place: str) -> None:
+def _check(content: Json, schema: Json, place: str) -> None:
     """Raise `UsageError` for an unknown key in a part of the file, and for a value that does not match the schema."""
     for key, value in content.items():
         if key not in schema:
@@ -232,7 +234,7 @@ def _fits(value: Any, schema: Any) -> bool:
     return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
-def _stage(name: str, definition: Values, values: Values, file: Path, place: str) -> ChainStage:
+def _stage(name: str, definition: Json, values: Variables, file: Path, place: str) -> ChainStage:
     values = _values(file, definition.get("vars", []), values, place)
     used = {key: definition[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in definition}
     resolved = fill_template(used, values, place)
@@ -275,7 +277,7 @@ def _is_within(path: str, folder: str) -> bool:
     return posixpath.isabs(folder) and posixpath.commonpath([path, folder]) == folder
 
 
-def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> Values:
+def _values(file: Path, entries: Sequence[Any], before: Variables, place: str) -> Variables:
     """Return the values available to texts: those of ``before``, overridden by those of ``vars``."""
     values = before
     for entry in entries:
@@ -287,17 +289,17 @@ def _values(file: Path, entries: Sequence[Any], before: Values, place: str) -> V
     return values
 
 
-def _merge_values(before: Values, over: Values) -> Values:
+def _merge_values(before: Variables, over: Variables) -> Variables:
     merged = {
-        key: _merge_values(before[key], value)
-        if isinstance(value, Mapping) and isinstance(before.get(key), Mapping)
+        key: _merge_values(existing, value)
+        if isinstance(value, Mapping) and isinstance(existing := before.get(key), Mapping)
         else value
         for key, value in over.items()
     }
     return {**before, **merged}
 
 
-def _mapping(file: Path, *, missing: bool = False) -> Values:
+def _mapping(file: Path, *, missing: bool = False) -> Json:
     """Return the contents of a YAML file; an empty mapping if the file does not exist and may be ``missing``."""
     try:
         value = config_text.load_yaml(regular.content(file, config_text.MAX_CHARACTERS))

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Float32s
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.sensors.live import LSL, Declaration, Live, MessageSizes, Value, blocks
 from tacpipe.sensors.sensor import Samples
 
@@ -53,7 +53,7 @@ class Message:
         """Declared values that this message lacks."""
         return ABSENT
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the message for JSON and msgpack; numbers that are not finite become null."""
         fields = {
             value.name: _to_json(value.read(self), value.digits)
@@ -121,7 +121,7 @@ class Description:
         """Return name and unit of each number in `Message.numbers`."""
         return [(column.name, column.unit) for _, column in self.declaration.columns(LSL, self.sizes)]
 
-    def schema(self) -> Json:
+    def schema(self) -> JsonObject:
         """Return the JSON schema properties of `Message.to_dict`."""
         values = [value for value in self.declaration.values if value.json and value.name not in self.absent]
         fields = {
@@ -129,7 +129,7 @@ class Description:
         }
         return {"version": {"type": "integer"}, "kind": {"type": "string"}, **fields}
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the description for JSON and msgpack."""
         raise NotImplementedError
 
@@ -142,7 +142,7 @@ def head_values() -> tuple[Value, ...]:
     )
 
 
-def to_json(content: Json) -> bytes:
+def to_json(content: JsonObject) -> bytes:
     """Return a message or description as JSON."""
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 

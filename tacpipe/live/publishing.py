@@ -14,7 +14,7 @@ from typing import Protocol, Self
 from urllib.parse import parse_qsl
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.links import lsl, network
 from tacpipe.live.messages import Description, Message, packets, to_json
 from tacpipe.live.settings import SessionOptions
@@ -282,11 +282,11 @@ class UdpPublisher:
         self._socket.close()
 
 
-def _msgpack() -> Callable[[Json], bytes]:
+def _msgpack() -> Callable[[JsonObject], bytes]:
     with extras.explain_missing("--publish udp with format=msgpack"):
         import msgpack
 
-    def packed(content: Json) -> bytes:
+    def packed(content: JsonObject) -> bytes:
         datagram: bytes = msgpack.packb(content)
         return datagram
 

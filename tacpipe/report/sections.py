@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, TaskReport, grouped
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, context, frames, screen
@@ -60,7 +60,7 @@ def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
     return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
 
 
-def leaves(tree: Json) -> dict[str, str]:
+def leaves(tree: JsonObject) -> dict[str, str]:
     """Return nested values as text, by the names that lead to them.
 
     >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})

@@ -206,7 +206,7 @@ def test_a_material_is_unknown_until_enough_of_the_slide_has_come(kind: str, mod
     enough = 1.0 if kind == "minirocket" else 0.5
     for message in messages[len(before) :]:
         assert (message.probabilities is None) == (message.seen < enough) == bool(message.cause)
-        content = message.to_dict()
+        content: Any = message.to_dict()
         assert (content["material"] == "unknown") == (message.probabilities is None)
         assert message.probabilities is None or abs(sum(content["probabilities"].values()) - 1) < 1e-5
     fractions = [message.seen for message in messages]

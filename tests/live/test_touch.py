@@ -134,7 +134,7 @@ def test_candidates_are_ranked_by_contact_balance_or_a_level_as_computed_by_hand
         message = Session(models["tree-ensemble"], rank).ask(request(cloud))
         assert np.allclose(message.scores, scores, atol=1e-6)
         assert message.ranks.index(1) == int(scores.argmax())
-        content = message.to_dict()
+        content: Any = message.to_dict()
         assert content["best"] == int(scores.argmax()) and content["criterion"] == rank
         assert [candidate["rank"] for candidate in content["candidates"]] == list(message.ranks)
         assert json.loads(json.dumps(content, allow_nan=False)) == content

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.live import messages
 from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
@@ -184,7 +184,7 @@ class ForecastDescription(messages.Description):
         """The fields that are absent: quantiles, if the session publishes none."""
         return ABSENT if self.quantiles else QUANTILES
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the description for JSON and msgpack."""
         return {
             "version": VERSION,

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from tacpipe.arrays import Float32s
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
@@ -149,7 +149,7 @@ class MaterialDescription(messages.Description):
         """Names of the materials."""
         return Sizes(self.channels)
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the description as a dict for JSON and msgpack."""
         return {
             "version": VERSION,

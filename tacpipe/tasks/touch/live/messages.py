@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.channels import biotac_sp
-from tacpipe.io import Json
+from tacpipe.io import JsonObject
 from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, Value, latency_values
@@ -179,7 +179,7 @@ class TouchDescription(messages.Description):
         """Names of the predicted values."""
         return Sizes(COLUMNS)
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the description as a dict for JSON and msgpack."""
         return {
             "version": VERSION,
