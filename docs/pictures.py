@@ -73,7 +73,7 @@ def first_screen(page: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         screenshot = Path(folder) / "report.png"
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--window-size={WIDTH},{HEIGHT}"]
-        flags.append("--virtual-time-budget=10000")  # ms of virtual time, in which the page draws its charts
+        flags.append("--timeout=15000")  # ms, in which the page draws its charts
         subprocess.run(
             [browser, *flags, f"--screenshot={screenshot}", page.resolve().as_uri()],
             check=True,
