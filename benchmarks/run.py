@@ -25,6 +25,7 @@ MODULES = (
     "small",
     "verified_reads",
     "synchronization",
+    "held_trials",
     "decode",
     "forward_training",
     "material_training",
@@ -40,6 +41,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--only", nargs="+", choices=MODULES, default=MODULES)
     chosen = parser.parse_args()
+    timing.adopt_orphans()
     lines: list[timing.Line] = []
     with tempfile.TemporaryDirectory(prefix="tacpipe-bench-") as folder:
         for name in chosen.only:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
 import os
 import resource
@@ -17,6 +19,7 @@ from pathlib import Path
 
 PYTHON = sys.executable
 BIN = Path(sys.executable).parent
+SET_CHILD_SUBREAPER = 36  # option of Linux's prctl
 Times = dict[str, list[float]]  # seconds of each round, by contestant
 _RUSAGE_OF_CHILD = """
 import json, os, re, sys
@@ -52,8 +55,16 @@ class Cost:
     read_bytes: int
 
 
+def adopt_orphans() -> None:
+    """Become the parent of processes whose parent ends, such as workers of a command, so that they are counted."""
+    ctypes.CDLL(None).prctl(SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
 def cpu_seconds() -> float:
-    """Return the user and system time of this process and of the children that ended."""
+    """Return the user and system time of this process and of its children, after all of them ended."""
+    with contextlib.suppress(ChildProcessError):
+        while True:
+            os.wait()
     usages = (resource.getrusage(processes) for processes in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
