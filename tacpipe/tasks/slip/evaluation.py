@@ -127,6 +127,7 @@ class EvaluatedSlips:
             by_predictor[name] = {
                 "auc": metrics.areas(own, draws),
                 "brier": float(f"{brier:.6g}") if brier == brier else None,
+                "accuracy": metrics.accuracy(probabilities, own, draws),
                 "alarms": self.alarms(name, horizon_ns, draws),
             }
             if name != MODEL:

@@ -195,6 +195,14 @@ def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:
     return float((weights * np.square(probabilities - slips)).sum() / total) if total else float("nan")
 
 
+def accuracy(probabilities: AnyFloats, windows: WindowScores, draws: Floats) -> ObjectEstimate:
+    """Return the fraction of windows whose slip is stated with a probability on the right side of one half."""
+    right = (probabilities >= 0.5) == (windows.states > STABLE)
+    sums = np.stack([np.bincount(windows.objects, part, windows.object_count) for part in (right, np.ones(len(right)))])
+    drawn = draws @ sums.T  # (draw, right or all)
+    return estimate(float(right.mean()) if len(right) else float("nan"), drawn[:, 0] / np.maximum(drawn[:, 1], 1))
+
+
 def score_alarm(
     tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | float, horizon_ns: int, draws: Floats
 ) -> SlipAlarmScore:

@@ -33,9 +33,10 @@ class SlipModelParams(ABC):
     ARCHITECTURES: ClassVar[str] = "slip"  # name of the task in entry points
     architecture: str = "boosting"
     streams: Names = ""  # names of tactile streams to read; empty: all
-    # time that the model looks back; 0: only the current row
+    # time that the model looks back; 0: only the current row, whose channels are the features
     window_s: Annotated[float, Range(0, 60), Unit("s")] = 1.0
-    horizon_s: Annotated[PositiveFloat, Unit("s")] = 1.0  # time ahead for which the probability is stated
+    # time ahead for which the probability is stated; 0: the current row, such as whether a grasp is stable
+    horizon_s: Annotated[NonNegativeFloat, Unit("s")] = 1.0
     # time at the start of a recording whose mean is the level at rest; 0: values are relative to rest already
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
     # time after a slip that is neither slip nor stable contact

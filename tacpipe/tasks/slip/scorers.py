@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
 from tacpipe.tasks.slip.boosting import BoostedTrees
-from tacpipe.tasks.slip.features import combine_fingers, feature_names, finger_features
+from tacpipe.tasks.slip.features import feature_names
 from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
 
 if TYPE_CHECKING:
@@ -85,10 +85,7 @@ class BoostedScorer:
 
     def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
         """Return the score of one window (time, channel) of each finger."""
-        by_finger = [
-            finger_features(window[None], finger.places) for window, finger in zip(windows, reader.fingers, strict=True)
-        ]
-        features = combine_fingers(by_finger)
+        features = reader.window_features([window[None] for window in windows])
         return float(self.trees.scores(features[:, self.columns])[0])
 
     def arrays(self) -> dict[str, AnyArray]:
@@ -103,7 +100,7 @@ class BoostedScorer:
     def load(cls, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> BoostedScorer:
         """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another."""
         columns = tuple(map(int, described["columns"]))
-        available = len(feature_names(len(reader.fingers))) + 1
+        available = reader.feature_count + 1
         if not all(0 <= column < available for column in columns):
             raise ValueError(f"columns {columns} of {available} features")
         return cls(BoostedTrees.from_arrays(arrays, len(columns)), columns)
@@ -131,9 +128,14 @@ def load_scorer(
     raise ValueError(f"the architecture {architecture} has no scorer")
 
 
-def baseline_columns(fingers: int) -> dict[str, tuple[int, ...]]:
-    """Return the columns that each baseline reads: the time, shear over load or else the level, and the total change."""
-    names = feature_names(fingers)
+def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
+    """Return the columns that each baseline reads: the time, shear over load or else the level, and the total change.
+
+    Windows of one row have no such features, so only the time remains.
+    """
+    names = feature_names(len(reader.fingers))
+    if reader.feature_count != len(names):
+        return {"time_only": (reader.feature_count,)}
 
     def places(*words: str) -> tuple[int, ...]:
         return tuple(index for index, name in enumerate(names) if name.removeprefix("largest ") in words)

@@ -79,7 +79,7 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
     held_out = labelled_tracks(reader, validation) if validation is not None else []
     calibration = calibrate_scorer(scorer, _fit_params(params, workspace), windows, held_out)
     baselines, levels = {}, {}
-    for name, columns in baseline_columns(len(reader.fingers)).items():
+    for name, columns in baseline_columns(reader).items():
         fit = functools.partial(_fit_baseline, columns=columns)
         baselines[name] = fit(windows, "")
         levels[name] = calibrate_scorer(baselines[name], fit, windows, held_out).to_config()["levels"]

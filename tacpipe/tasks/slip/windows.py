@@ -235,17 +235,32 @@ class FingerReader:
             )
         return recording.table(stream, names)
 
+    @property
+    def feature_count(self) -> int:
+        """The number of features: those of windows, or the channels if windows have one row."""
+        if self._reads_rows:
+            return sum(len(finger.channels) for finger in self.fingers)
+        return len(feature_names(len(self.fingers)))
+
+    @property
+    def _reads_rows(self) -> bool:
+        return all(finger.rows == 1 for finger in self.fingers)
+
+    def window_features(self, windows: Sequence[AnyFloats]) -> Floats:
+        """Return the features (window, feature) of windows (window, time, channel) of each finger."""
+        if self._reads_rows:
+            return np.concatenate([part[:, -1] for part in windows], axis=1)
+        by_finger = [finger_features(part, finger.places) for part, finger in zip(windows, self.fingers, strict=True)]
+        return combine_fingers(by_finger)
+
     def features(self, track: GraspTrack, rows: Indices) -> Floats:
         """Return the features of rows of a track (row, feature), with the time since the start behind them."""
-        columns = len(feature_names(len(self.fingers)))
+        columns = self.feature_count
         features = np.empty((len(rows), columns + 1))
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
-            by_finger = [
-                finger_features(track.windows(rows[block], index, finger.rows), finger.places)
-                for index, finger in enumerate(self.fingers)
-            ]
-            features[block, :columns] = combine_fingers(by_finger)
+            windows = [track.windows(rows[block], index, finger.rows) for index, finger in enumerate(self.fingers)]
+            features[block, :columns] = self.window_features(windows)
         features[:, columns] = track.since_s[rows]
         return features
 
@@ -386,7 +401,7 @@ def read_windows(
     features = [reader.features(track, rows) for track, (rows, _) in zip(tracks, parts, strict=True)]
     owners = np.repeat(np.arange(len(tracks)), [len(rows) for rows, _ in parts])
     slips = _joined(states for _, states in parts) > STABLE
-    stacked = np.concatenate(features) if features else np.zeros((0, len(feature_names(len(reader.fingers))) + 1))
+    stacked = np.concatenate(features) if features else np.zeros((0, reader.feature_count + 1))
     weights = match_time(stacked[:, -1], slips) if params.match_time else np.ones(len(slips))
     return TrainingWindows(
         reader, tuple(tracks), params, owners, _joined(rows for rows, _ in parts), stacked, slips, weights

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from tacpipe.tasks.slip.model import SlipModel, calibrate, predict
 from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule
 from tacpipe.tasks.slip.rule import score_forecasts
 from tacpipe.tasks.task import CalibrationRequest
-from tests.fake_recordings import dataset
+from tests.fake_recordings import FakeRecording, dataset
 from tests.tasks.slip.slip_recordings import held_object, trials
 
 SMALL = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2)
@@ -144,3 +145,30 @@ def test_the_rule_scores_the_rise_and_the_fall_of_the_predicted_shear() -> None:
             columns.append(pa.array([value], pa.float32()))
     table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
     assert score_forecasts(table).tolist() == [1.5]  # rises by 2 and falls by 1, at a load of 2
+
+
+def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path) -> None:
+    def grasps(seed: int) -> FakeRecording:
+        rng = np.random.default_rng(seed)
+        slips = rng.random(40) < 0.5
+        readings = rng.normal(0, 1, (40, 6))
+        readings[:, 2] += 4 * slips
+        fields = [pa.field("t_ns", pa.int64())]
+        fields += [pa.field(f"e{n}", pa.float64(), metadata={"quantity": "tactile", "unit": "count"}) for n in range(6)]
+        columns = [pa.array(np.arange(40) * 10**10), *map(pa.array, readings.T), pa.array(slips.astype(np.int8))]
+        table = pa.Table.from_arrays(columns, schema=pa.schema([*fields, pa.field("slip", pa.int8())]))
+        return FakeRecording({"hand": table}, f"object-{seed}")
+
+    params = dataclasses.replace(SMALL, window_s=0.0, horizon_s=0.0, rest_s=0.0, match_time=False)
+    files = training.train(params, dataset(*map(grasps, range(8))), None, tmp_path)
+    metrics = json.loads(evaluation.evaluate(files, dataset(*map(grasps, range(20, 24)))).files["metrics.json"])
+    assert metrics["counts"]["windows"] == 160
+    assert metrics["model"]["accuracy"]["value"] > 0.9 > 0.7 > metrics["constant"]["accuracy"]["value"]
+    assert metrics["model"]["auc"]["during"]["value"] > 0.95
+    recording = grasps(30)
+    model = SlipModel.load(files)
+    track = model.reader.track(recording)  # type: ignore[arg-type]
+    assert (
+        model.scorer.score_window(model.reader, [track.fingers[0].values[:1]])
+        == model.table(recording)["score"][0].as_py()
+    )
