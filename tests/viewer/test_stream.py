@@ -16,6 +16,7 @@ import pytest
 import tacpipe
 from tacpipe.traces import drawing, taxels
 from tacpipe.viewer import contents, session
+from tacpipe.viewer.markers import MarkerTrack
 from tests.conftest import Lab
 from tests.traces.test_forecasts import predictions
 from tests.viewer import hand
@@ -233,3 +234,17 @@ def test_the_viewer_s_program_keeps_and_sends_no_statistics(
     for environment, expected in ((session.environment(), False), (dict(os.environ), True)):
         subprocess.run([session.program(), "rrd", "verify", file], env=environment, check=True)
         assert any("analytics" in path.name for path in own_home.rglob("*")) == expected
+
+
+def test_markers_of_a_gel_and_their_displacement_are_written_over_its_frames(tmp_path: Path) -> None:
+    rest_px = np.array([[10.0, 20.0], [30.0, 20.0]])
+    positions_px = np.array([rest_px, [[11.0, 22.0], [np.nan, np.nan]]])  # the second marker is hidden at last
+    track = MarkerTrack("gel", np.array([0, 40_000_000]), rest_px, positions_px)
+    drawn = contents.DrawnContents("trial", {}, {}, markers=[track])
+    (file,) = session.write([drawn], tmp_path, "data")
+    entities = read(file)
+    t_ns, positions = timed(entities["/cameras/gel/markers"], "Points2D:positions")
+    assert t_ns.tolist() == [0, 40_000_000]
+    assert positions == [rest_px.tolist(), [[11.0, 22.0]]]
+    _, vectors = timed(entities["/cameras/gel/displacement"], "Arrows2D:vectors")
+    assert vectors == [[[0.0, 0.0], [0.0, 0.0]], [[3.0, 6.0]]]
