@@ -243,8 +243,8 @@ def test_markers_of_a_gel_and_their_displacement_are_written_over_its_frames(tmp
     drawn = contents.DrawnContents("trial", {}, {}, markers=[track])
     (file,) = session.write([drawn], tmp_path, "data")
     entities = read(file)
-    t_ns, positions = timed(entities["/cameras/gel/markers"], "Points2D:positions")
+    t_ns, positions = measure_time(entities["/cameras/gel/markers"], "Points2D:positions")
     assert t_ns.tolist() == [0, 40_000_000]
     assert positions == [rest_px.tolist(), [[11.0, 22.0]]]
-    _, vectors = timed(entities["/cameras/gel/displacement"], "Arrows2D:vectors")
+    _, vectors = measure_time(entities["/cameras/gel/displacement"], "Arrows2D:vectors")
     assert vectors == [[[0.0, 0.0], [0.0, 0.0]], [[3.0, 6.0]]]
