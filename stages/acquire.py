@@ -86,7 +86,7 @@ def report_spools_of_others(store: Store) -> None:
 
 
 def measure(rig: Rig) -> dict[str, Figures]:
-    """Open every stream for `DRY_RUN_S` without recording, and return its figures by name.
+    """Open every stream for `DRY_RUN_S` without recording; return the figures of each by its name.
 
     Raises `DeviceError` if streams do not open or send nothing.
     """

@@ -29,7 +29,8 @@ class Grasp:
 
     g1_m: Floats  # (xyz), metres
     g2_m: Floats  # (xyz), metres
-    wrist: Floats | None = None  # (component, axis): columns are approach, closing and third axis in the cloud's frame
+    # (component, axis): the columns are the approach, closing and third axes in the cloud's frame
+    wrist: Floats | None = None
 
     def __post_init__(self) -> None:
         """Validate the points and the wrist."""

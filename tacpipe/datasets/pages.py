@@ -353,8 +353,8 @@ class Pages:
                     self._checked.add(number)
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError, StopIteration) as error:
                 raise DamagedError(
-                    f"The page {page.digest[:12]} of a manifest is not one of tacpipe ({plain(str(error), 200)}). Restore "
-                    f"the manifest, or run the stage that made it again."
+                    f"The page {page.digest[:12]} of a manifest was not written by tacpipe ({plain(str(error), 200)}). "
+                    f"Restore the manifest, or rerun the stage that made it."
                 ) from None
             while len(self._parsed) >= _PARSED:
                 del self._parsed[next(iter(self._parsed))]

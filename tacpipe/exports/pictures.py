@@ -98,7 +98,7 @@ def with_start_codes(packet: bytes, size_bytes: int) -> bytes:
 
 
 def _read_units(extradata: bytes, offset: int, count: int, units: list[bytes]) -> int:
-    """Add ``count`` units with sizes of two bytes to ``units``; return the offset after them."""
+    """Append ``count`` units, each preceded by its size in two bytes, to ``units``; return the offset after them."""
     for _ in range(count):
         stop = offset + 2 + int.from_bytes(extradata[offset : offset + 2])
         units.append(extradata[offset + 2 : stop])

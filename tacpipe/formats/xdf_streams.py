@@ -250,7 +250,7 @@ def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> N
     elif chunk.stream is None:
         return
     elif chunk.tag == xdf_chunks.STREAM_HEADER:
-        _describe(read, chunk.stream, chunk, path)
+        _store_description(read, chunk.stream, chunk, path)
     elif chunk.stream not in read.streams:
         read.unknown.setdefault(chunk.stream, UNDESCRIBED)
     elif chunk.tag == xdf_chunks.SAMPLES:
@@ -263,7 +263,7 @@ def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> N
         read.streams[chunk.stream].declared = _sample_count(chunk.content)
 
 
-def _describe(read: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
+def _store_description(read: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
     """Store the description of a stream. Raises `UsageError` for a second, different description."""
     before = read.headers.get(stream)
     if before is None:

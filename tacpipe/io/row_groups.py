@@ -113,7 +113,10 @@ class SpilledRows:
         return self._head
 
     def groups(self, rows: int) -> Iterator[pa.Table]:
-        """Yield tables of ``max_rows`` rows, the last with the remainder; one empty table if there are no rows."""
+        """Yield tables of ``rows`` rows, the last with the remainder; one empty table if there are no rows.
+
+        ``rows`` must be the maximum that was passed to the constructor.
+        """
         assert rows == self._max_rows
         group, self._head = self._head, None
         while group is not None:

@@ -18,7 +18,7 @@ from tacpipe.video.images import read_shape
 MAX_HEAD_BYTES = 1 << 14  # limit of the head of a response or of an image
 MAX_IMAGE_BYTES = 1 << 25
 READ_BYTES = 1 << 18
-ANSWER_S = 5.0  # limit for the head of the response
+ANSWER_S = 5.0  # timeout for the head of the response
 HEAD_END = b"\r\n\r\n"
 STAMP = "x-timestamp"  # seconds, which mjpg-streamer and ustreamer send with each image
 MAX_STAMP_S = 1e10  # later stamps are invalid

@@ -60,7 +60,7 @@ class Engine(ABC):
         return None
 
     def take(self, stream: str, block: Chunks | StreamNote) -> None:
-        """Process a block of a stream, or a note on all streams (``stream`` is empty)."""
+        """Process a block of a stream or a note on it or, if ``stream`` is empty, a note on all streams."""
         if isinstance(block, Chunks):
             self.take_chunks(stream, block)
         elif stream:

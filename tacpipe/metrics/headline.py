@@ -194,7 +194,10 @@ def format_count(count: int, plural: str) -> str:
 
 
 def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows of a table of headlines with the same columns: model and best baseline per headline."""
+    """Return the header and the rows of a table of headlines, which must have the same columns.
+
+    Each headline has a row for the model, one for its best baseline, and one for each other baseline of the table.
+    """
     if not headlines:
         return [], []
     first = headlines[0]
@@ -202,11 +205,11 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
     rows = []
     for headline in headlines:
         best = headline.best
-        gain = [format_gain(headline.gain, headline.measure) if best else NONE, bounds(headline) or NONE]
+        gain_cells = [format_gain(headline.gain, headline.measure) if best else NONE, bounds(headline) or NONE]
         n = format_count(headline.clusters, headline.cluster) + (
             f", {headline.seeds} seeds" if headline.seeds > 1 else ""
         )
-        rows.append([headline.where, headline.method, *map(number, headline.model.values), *gain, n])
+        rows.append([headline.where, headline.method, *map(number, headline.model.values), *gain_cells, n])
         if best:
             verdicts = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
             verdict_text = verdicts.get(headline.verdict, "too few for a verdict")

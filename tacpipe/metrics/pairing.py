@@ -208,7 +208,7 @@ def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = Non
     if not names:
         return Estimate(float("nan"), float("nan"), float("nan"))
     rows = rows[:, :, : rows.shape[2] // 2]
-    relative = measure.name == "skill"  # ratios of errors are compared
+    relative = measure.name == "skill"  # skill compares errors by their ratio, points by their difference
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         error = measure.error(draws)

@@ -287,7 +287,7 @@ class StatisticsClassifier:
 
         The class with the highest score wins.
 
-        Raises `TacpipeError` if slides have other channels than the training slides, or a value is not finite.
+        Raises `TacpipeError` if the channels differ from those of the training slides, or a value is not finite.
         """
         return self.readout.scores(view_features(x, self.view))
 

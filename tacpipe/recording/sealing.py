@@ -142,15 +142,15 @@ class Sealed:
 
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
-    """Return the decoded streams of a spool by name."""
+    """Decode all streams of a spool; return them by name."""
     from tacpipe.io.spill import Spill
 
     end_ns = max((tally.last_ns for tally in spooled.tallied().values()), default=0)
     spill = Spill(MEMORY_BYTES)
-    return {name: stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
+    return {name: seal_stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
 
 
-def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill | None = None) -> Sealed:
+def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill | None = None) -> Sealed:
     """Return one decoded stream of a spool with ``t_ns`` in UTC, the device's time and counters, and the channels.
 
     ``end_ns`` is the arrival of the last byte of any stream: a stream that ended long before gets an event. Samples are

@@ -215,7 +215,8 @@ def _triggers(
         starts["contact"], stops["contact"] = contact.touched, contact.released
     if tap is not None:
         starts["tap"], stops["tap"] = (lambda: tap.received("start")), (lambda: tap.received("stop"))
-        stops["duration"] = lambda: tap.received("start") and False  # a start during a trial does not begin another
+        # discards start messages that arrive during a trial, so that they do not start the next trial
+        stops["duration"] = lambda: tap.received("start") and False
     return starts[plan.start], stops[plan.stop]
 
 

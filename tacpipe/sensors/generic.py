@@ -47,10 +47,10 @@ class Generic(layout.DescribedSensor):
     marker: str = ""  # first bytes of each frame, in hexadecimal: "AA 55"
     tail: str = ""  # last bytes of each frame, in hexadecimal: "0D 0A"
     order: layout.Order = "little"  # byte order of numbers
-    sum: layout.Sum | None = None  # the checksum of a frame, and the number that contains it
-    sequence: layout.Sequence | None = None  # the number that counts the frames
-    clock: layout.Clock | None = None  # the number that contains the device's time
-    # the number that contains the size of a frame; if absent, all frames have the same size
+    sum: layout.Sum | None = None  # the checksum of a frame, and the field that contains it
+    sequence: layout.Sequence | None = None  # the field that contains the frame counter
+    clock: layout.Clock | None = None  # the field that contains the device's time
+    # the field that contains the size of a frame; if absent, all frames have the same size
     length: layout.Length | None = None
     packets: bool = False  # each packet of the link is one frame (udp, hid), so no marker is needed
     start: str = ""  # bytes that start the stream, in hexadecimal; empty: the board streams by itself

@@ -53,33 +53,33 @@ class Sum:
     """The checksum of a frame."""
 
     kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # algorithm
-    number: str  # name of the number that contains it
+    number: str  # name of the field that contains it
     begin: int = 0  # first byte of the summed range, from 0; negative values count from the frame's end
     end: int | None = None  # end of the summed range (exclusive); if absent, the start of the checksum
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """The number that counts the frames."""
+    """The field that contains the frame counter."""
 
-    number: str  # name of the number that contains it
+    number: str  # name of the field that contains it
     modulus: int = 0  # modulus of the counter; 0: the range of its type
     step: int = 1  # increment per frame
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The number that contains the device's time."""
+    """The field that contains the device's time."""
 
-    number: str  # name of the number that contains it
-    unit: Literal["ns", "us", "ms", "s"]  # unit of that number
+    number: str  # name of the field that contains it
+    unit: Literal["ns", "us", "ms", "s"]  # unit of the time
 
 
 @dataclass(frozen=True)
 class Length:
-    """The number that contains the size of a frame, for boards that send frames of several sizes."""
+    """The field that contains the size of a frame, for boards that send frames of several sizes."""
 
-    number: str  # name of the number that contains it
+    number: str  # name of the field that contains it
     plus: int = 0  # bytes of the frame that it does not count
 
 

@@ -186,7 +186,10 @@ def with_crc(body: bytes) -> bytes:
 
 
 def _reply_finder(address: int, function: int, size: int) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return a function that finds a reply of ``size`` bytes. It raises `DeviceError` for an error reply of five bytes."""
+    """Return a function that returns the start and stop of a reply of ``size`` bytes, or 0 if there is none yet.
+
+    It raises `DeviceError` for an error reply of five bytes.
+    """
 
     def find(received: bytes) -> int | tuple[int, int]:
         for code, length in ((function, size), (function | REFUSED, 5)):

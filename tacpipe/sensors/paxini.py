@@ -305,9 +305,10 @@ def _read_request(register: int, length: int, description: str) -> Ask:
 
 
 def _reply_finder(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return a function that finds a reply among received bytes, which may contain frames of an earlier stream.
+    """Return a function that returns the start and stop of a reply in received bytes, or 0 if there is none yet.
 
-    The reply to a write may lack the data whose length it declares.
+    It raises `DeviceError` if the board refused the request. The bytes may also contain frames of an earlier stream,
+    and the reply to a write may lack the data whose length it declares.
     """
 
     def find(received: bytes) -> int | tuple[int, int]:

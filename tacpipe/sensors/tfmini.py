@@ -175,7 +175,10 @@ def _request(number: int, payload: bytes = b"") -> Ask:
 
 
 def _reply_finder(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return a function that finds the reply among frames, which may contain its first bytes by chance."""
+    """Return a function that returns the start and stop of the reply in received bytes, or 0 if there is none yet.
+
+    Frames may contain the first bytes of the reply by chance.
+    """
     size = 5 if number == SAVE else len(payload) + 4
     head = bytes([0x5A, size, number])
 

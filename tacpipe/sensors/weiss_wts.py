@@ -227,7 +227,7 @@ def run_lengths(cells: Counts) -> Counts:
 
 
 def _reply_finder(number: int, *, refusable: bool = False) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return a function that finds the reply among frames."""
+    """Return a function that returns the start and stop of the reply among frames, or 0 if there is none yet."""
 
     def find(data: bytes) -> int | tuple[int, int]:
         for packet, stop, payload in messages(data):

@@ -30,7 +30,7 @@ from tacpipe.simulation.grasp_scene import (
     GraspRig,
     GraspScene,
     Readings,
-    draw_thing,
+    draw_object,
     families,
     perform,
     read_sensors,
@@ -155,7 +155,7 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
     moments_ns: dict[str, int] = {}
     if rig.raw:
         course = pinch.course(t_ns, rng)
-        neighbour = draw_thing(seed, index + 1 + int(rng.integers(1_000)), rig)
+        neighbour = draw_object(seed, index + 1 + int(rng.integers(1_000)), rig)
         view = depth_camera.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
         streams |= depth_camera.tables(view)
         streams["biotac_sp"] = _readings_over_time(hand, scene, readings, course, rig, rng)

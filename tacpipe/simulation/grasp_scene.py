@@ -45,7 +45,7 @@ class Thing:
         return 1 / MODULI_PA[self.stiffness]
 
 
-def draw_household_thing(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
+def draw_household_object(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
     """Return a random object of a family, named by the family and ``number``, such as "cone-03".
 
     ``stiffness`` is one of `MODULI_PA`, or mixed. Raises `TacpipeError` for an unknown family or stiffness.
@@ -226,16 +226,16 @@ def families(rig: GraspRig) -> tuple[str, ...]:
     return ("sphere",) if rig.spheres else names
 
 
-def draw_thing(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
-    """Return the object of trial ``index``. It does not depend on the other objects, except with ``spheres``."""
+def draw_object(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
+    """Return the object of trial ``index``. With ``rig.spheres``, all trials have the same object."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
-        drawn = draw_household_thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
+        drawn = draw_household_object(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
         return replace(drawn, name="spheres", shape=Ellipsoid(np.full(3, REFERENCE_M)))
     names = families(rig)
     number, kind = divmod(index % (len(names) * rig.objects), len(names))
     rng = np.random.default_rng([seed, THINGS, FAMILIES.index(names[kind]), number])
-    return draw_household_thing(rng, names[kind], number + 1, rig.stiffness)
+    return draw_household_object(rng, names[kind], number + 1, rig.stiffness)
 
 
 def sensors(seed: int) -> fingertip_sp.Sensors:
@@ -245,7 +245,7 @@ def sensors(seed: int) -> fingertip_sp.Sensors:
 
 def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:
     """Simulate the scene of trial ``index``. Raises `TacpipeError` if no grasp is possible in `MAX_POSES` poses."""
-    thing = draw_thing(seed, index, rig)
+    thing = draw_object(seed, index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
     rests = thing.shape.rests()
     scale = float(rng.uniform(*SPHERES_M)) / REFERENCE_M if rig.spheres else 1.0

@@ -114,7 +114,7 @@ def material(seed: int, sensor: str, number: int, rig: SlideRig = SlideRig()) ->
     """Return material ``number`` for ``sensor``. It is the same for both sensors if they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
     index = 0 if rig.identical_materials else number
-    return texture.material(np.random.default_rng([seed, MATERIAL, source, index]))
+    return texture.draw_material(np.random.default_rng([seed, MATERIAL, source, index]))
 
 
 def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> RecordingOutput:

@@ -54,15 +54,16 @@ class Waves:
     phase_rad: Floats
 
 
-def material(rng: np.random.Generator) -> Material:
+def draw_material(rng: np.random.Generator) -> Material:
     """Return a random material."""
-    fraction, roughness = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
+    background_fraction, roughness_n = rng.uniform(*BACKGROUND), rng.uniform(*ROUGHNESS_N)
     amplitude = rng.uniform(*AMPLITUDE, GRATINGS)
-    amplitude *= roughness * np.sqrt((1 - fraction) / (amplitude**2 / 2).sum())
+    # scaled so that the gratings have the variance that the background leaves of the whole
+    amplitude *= roughness_n * np.sqrt((1 - background_fraction) / (amplitude**2 / 2).sum())
     return Material(
         wavelength_m=rng.uniform(*WAVELENGTH_M, GRATINGS),
         amplitude_n=amplitude,
-        background_n=float(roughness * np.sqrt(fraction)),
+        background_n=float(roughness_n * np.sqrt(background_fraction)),
         exponent=float(rng.uniform(*EXPONENT)),
         friction=float(rng.uniform(*FRICTION)),
         stiffness_n_m=float(rng.uniform(*STIFFNESS_N_M)),

@@ -131,7 +131,7 @@ class RerunStream:
         pitch = spacing(finger.places)
         place = finger.places * (1, -1)  # pixel coordinates increase downwards
         self._static((*parts, "discs"), rr.Points2D(place, radii=0.42 * pitch, labels=finger.names, show_labels=False))
-        self._scale((*parts, "scale"), place, pitch, low, high, finger.unit)
+        self._write_colour_scale((*parts, "scale"), place, pitch, low, high, finger.unit)
         rows = _display_rows(finger.t_ns)
         t_ns, change, magnitude = finger.t_ns[rows], finger.change[rows], finger.magnitude[rows]
         if len(rows) > 1 and t_ns[0] > self._start_ns:  # the change is unknown before the first row
@@ -153,8 +153,10 @@ class RerunStream:
             flat = rr.Arrows2D.columns(vectors=np.ascontiguousarray(arrows, np.float32).reshape(-1, 2)).partition(count)
             self._columns((*parts, "shear"), t_ns, flat)
 
-    def _scale(self, parts: Sequence[str], place: Floats, pitch: float, low: float, high: float, unit: str) -> None:
-        """Write the colour scale of a map below it, with its ends."""
+    def _write_colour_scale(
+        self, parts: Sequence[str], place: Floats, pitch: float, low: float, high: float, unit: str
+    ) -> None:
+        """Write a colour scale below a map, labelled with its lowest and highest values."""
         rr = _rerun()
         left, right, bottom = place[:, 0].min(), place[:, 0].max(), place[:, 1].max() + 1.3 * pitch
         x = np.linspace(left, right, RAMP)

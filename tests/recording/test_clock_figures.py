@@ -69,7 +69,7 @@ class Recorded:
         spool.close()
         read = Spooled(spool.folder)
         read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}  # stamps then compare with the true time
-        self.sealed = sealing.stream(read, rig, "device")
+        self.sealed = sealing.seal_stream(read, rig, "device")
         self.table = self.sealed.table
         is_received = (arrival_ns < LOST_S[0] * 1e9) | (arrival_ns >= LOST_S[1] * 1e9)
         self.taken_ns = taken_ns[is_received]

@@ -68,7 +68,7 @@ def test_packets_of_other_senders_are_reported_once_a_second_and_at_the_end(
         spool.note(block) if isinstance(block, StreamNote) else spool.append("program", block)
     reader.stop()
     spool.close()
-    sealed = sealing.stream(Spooled(spool.folder), rig, "program")
+    sealed = sealing.seal_stream(Spooled(spool.folder), rig, "program")
     details = [event.detail for event in sealed.events if event.cause == station.FOREIGN]
 
     assert sum(int(detail.split()[0]) for detail in details) == 600

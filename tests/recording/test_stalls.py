@@ -87,7 +87,7 @@ def record(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
     spool.close()
     read = Spooled(spool.folder)
     read.header["clock"] = {"monotonic_ns": 0, "utc_ns": 0}
-    return sealing.stream(read, rig, name)
+    return sealing.seal_stream(read, rig, name)
 
 
 def stalls(sealed: Sealed) -> list[tuple[int, str]]:

@@ -19,7 +19,7 @@ from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import depth_camera, grasp_scene
 from tacpipe.simulation.grasp import session, simulate_trial, stamp_ns
-from tacpipe.simulation.grasp_scene import GraspRig, GraspScene, draw_thing, perform
+from tacpipe.simulation.grasp_scene import GraspRig, GraspScene, draw_object, perform
 from tests.simulation.grasp_datasets import SEED
 
 RIG = GraspRig()
@@ -180,11 +180,11 @@ def test_a_trial_follows_from_seed_and_number_whatever_the_number_of_trials() ->
 
 
 def test_objects_take_turns_and_stay_what_they_are_when_others_are_left_out() -> None:
-    names = Counter(draw_thing(SEED, index, RIG).name for index in range(60))
+    names = Counter(draw_object(SEED, index, RIG).name for index in range(60))
     assert set(names.values()) == {2}
     assert len(names) == 30
-    only_cone = draw_thing(SEED, 0, GraspRig(families="cone"))
-    mixed_cone = draw_thing(SEED, grasp_scene.FAMILIES.index("cone"), RIG)
+    only_cone = draw_object(SEED, 0, GraspRig(families="cone"))
+    mixed_cone = draw_object(SEED, grasp_scene.FAMILIES.index("cone"), RIG)
     assert (only_cone.name, only_cone.shape) == (mixed_cone.name, mixed_cone.shape) == ("cone-01", mixed_cone.shape)
 
 

@@ -13,7 +13,7 @@ from tests.simulation.texture_likelihood import likelihood_accuracy, likelihood_
 
 
 def material(seed: int = 0) -> texture.Material:
-    return texture.material(np.random.default_rng(seed))
+    return texture.draw_material(np.random.default_rng(seed))
 
 
 @given(st.integers(0, 10_000))

@@ -96,7 +96,7 @@ def find_episode(tree: Tree, name: str | None) -> Episode:
 
 
 def _episodes_from_ends(tree: Tree) -> list[Episode]:
-    """Return the recordings delimited by an array of ends; an empty list if there is no such array."""
+    """Return the recordings delimited by an array of their end rows; an empty list if the tree has no such array."""
     for path in ENDS:
         group = path.rpartition("/")[0]
         array = (
@@ -108,22 +108,21 @@ def _episodes_from_ends(tree: Tree) -> list[Episode]:
             ends = [int(end) for end in _read_ends(tree, array)]
             about = tree.attributes(group)
             names, names_stated = about.get(NAMES), True
-            if not isinstance(names, list) or len({str(array) for array in names}) != len(ends):
+            if not isinstance(names, list) or len({str(name) for name in names}) != len(ends):
                 names = [f"episode_{number:06d}" for number in range(len(ends))]  # LeRobot's names
                 names_stated = False
             labels = about.get(LABELS)
             return [
                 Episode(
-                    str(name),
-                    "",
-                    start,
-                    stop,
-                    number,
-                    len(ends),
-                    ends[-1],
-                    group,
-                    _labels_of_episode(labels, str(name)),
-                    names_stated,
+                    name=str(name),
+                    start=start,
+                    stop=stop,
+                    number=number,
+                    count=len(ends),
+                    total=ends[-1],
+                    ends_group=group,
+                    labels=_labels_of_episode(labels, str(name)),
+                    name_is_stated=names_stated,
                 )
                 for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
             ]

@@ -159,7 +159,7 @@ class _SingleMessages:
                 cells.append(shape.value(shape.leaves[self.leaves[column.leaf]], column.index))
 
     def blocks(self) -> Iterator[Block]:
-        """Yield the columns."""
+        """Yield one block of columns for each part of the message."""
         for part, values in zip(self.parts, self.values, strict=True):
             columns: dict[str, pa.Array] = {}
             about: dict[str, Mapping[str, str]] = {}

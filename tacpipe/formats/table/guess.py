@@ -91,7 +91,7 @@ def guess_layout(folder: Path) -> str:
 
 
 def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], list[_FileGroup], dict[str, str]]:
-    """Return the groups of files that are streams, the groups with labels, and the reason for each unreadable path."""
+    """Return the groups of files that are streams, the groups of label files, and the reason for each unusable path."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
         by_template.setdefault(_template(path), []).append(path)
@@ -110,10 +110,12 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         if sample.text is not None and not (sample.text.header or sample.text.rows):
             damaged |= {path.as_posix(): "it has no row" for path in paths}
             continue
-        shared = len(paths) == 1 < len(data) and _is_labels(sample)
+        is_shared_table = len(paths) == 1 < len(data) and _is_labels(sample)
         group = _FileGroup(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
-        single = sample.text is not None and sample.text.header and len(sample.text.rows) == 1 and len(paths) > 1
-        if shared or single:
+        has_one_row_per_file = (
+            sample.text is not None and sample.text.header and len(sample.text.rows) == 1 and len(paths) > 1
+        )
+        if is_shared_table or has_one_row_per_file:
             labels.append(group)
         else:
             streams += _group_by_length(group)

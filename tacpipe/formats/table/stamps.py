@@ -78,10 +78,10 @@ def format_expression(text: str) -> str:
     return f"^{regex}$"
 
 
-def parse_stamps(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
+def parse_stamps(column: pa.Array, time_format: str) -> tuple[Int64s, Bools]:
     """Return timestamps in nanoseconds since 1970 (ignoring the time zone) or since midnight, and whether each is valid.
 
-    ``column`` contains text of the format ``text``; both results have the shape (row,).
+    ``column`` contains text in the ``strptime`` format ``time_format``; both results have the shape (row,).
 
     >>> import pyarrow as pa
     >>> parse_stamps(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
@@ -90,7 +90,7 @@ def parse_stamps(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
     import numpy as np
     import pyarrow.compute as pc
 
-    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(text))
+    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(time_format))
     valid = groups.is_valid().to_numpy(zero_copy_only=False)
     parts = {field.name: pc.struct_field(groups, field.name).fill_null("") for field in groups.type}
 

@@ -224,7 +224,7 @@ class CloudSource(Sampled):
 
     def _view(self, number: int) -> tuple[Float32s, Bytes]:
         scene = grasp_scene.perform(self._seed, number)
-        neighbour = grasp_scene.draw_thing(self._seed, number + 1)
+        neighbour = grasp_scene.draw_object(self._seed, number + 1)
         rng = np.random.default_rng([self._seed, 9, number])
         cloud = depth_camera.view(
             scene.placed, neighbour.shape, scene.up, scene.camera_m, GraspRig().noise_scale, rng

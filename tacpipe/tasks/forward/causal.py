@@ -164,12 +164,12 @@ class Rolling:
         predicted: Float32s = levels[0].astype(np.float32)
         return predicted
 
-    def band(self, plan: AnyFloats, ahead: Float32s) -> Float32s:
-        """Return all quantiles (horizon, channel, level) of the result of `predict` for the same ``plan``.
+    def quantiles(self, plan: AnyFloats, ahead: Float32s) -> Float32s:
+        """Return all quantiles (horizon, channel, level) around ``ahead``, which `predict` returned for the same ``plan``.
 
         The model must have quantiles.
         """
-        quantiles: Float32s = self._forecaster.band(self._windows(plan), self._past[None], ahead[None])[0]
+        quantiles: Float32s = self._forecaster.forecast_quantiles(self._windows(plan), self._past[None], ahead[None])[0]
         return quantiles
 
     def _windows(self, plan: AnyFloats) -> ForecastWindows:

@@ -132,20 +132,20 @@ _COLUMNS = pa.schema(
 )
 
 
-def band(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: slice) -> Float32s:
+def model_quantiles(forecaster: Forecaster, track: Track, forecast: WindowForecast, part: slice) -> Float32s:
     """Return the model's quantiles (window, step, channel, level) for some windows of a forecast.
 
     The model must have quantiles.
     """
     windows = type(forecast.windows)(*(tensor[:, part] for tensor in forecast.windows))
-    return forecaster.band(windows, track.tactile[forecast.past[part]], forecast.count[part])
+    return forecaster.forecast_quantiles(windows, track.tactile[forecast.past[part]], forecast.count[part])
 
 
 def _predict_quantiles(
     forecaster: Forecaster, uncertainty: ForecastQuantiles, track: Track, forecast: WindowForecast, part: slice
 ) -> Iterator[tuple[str, AnyFloats]]:
     """Yield the quantiles (window, step, channel, level) of each predictor."""
-    yield MODEL, band(forecaster, track, forecast, part)
+    yield MODEL, model_quantiles(forecaster, track, forecast, part)
     yield UNCONDITIONAL, forecast.count[part][..., None] + uncertainty.unconditional.transpose(2, 1, 0)
     last = track.tactile[forecast.now[part]]
     yield BASELINE, last[:, None, :, None] + uncertainty.persistence.transpose(2, 1, 0)

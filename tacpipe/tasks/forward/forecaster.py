@@ -251,8 +251,8 @@ class Forecaster:
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         ahead = self._predict_arrays(touch, arm, finger)
-        read = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
-        quantiles = self.band(read, touch[:, -self.context :], ahead)[..., at]
+        windows = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
+        quantiles = self.forecast_quantiles(windows, touch[:, -self.context :], ahead)[..., at]
         return quantiles[0] if single else quantiles
 
     def error_features(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
@@ -262,8 +262,8 @@ class Forecaster:
         """
         return window_features(windows, past, ahead, self.channel_scale, self.actions)
 
-    def band(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
-        """Return all quantiles (window, step, channel, level) of the forecast ``ahead``.
+    def forecast_quantiles(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+        """Return all quantiles (window, step, channel, level) around the forecast ``ahead``.
 
         Arguments are those of `error_features`. The model must have quantiles.
         """
@@ -271,13 +271,13 @@ class Forecaster:
         return self.quantiles.quantiles(self.error_features(windows, past, ahead), ahead)
 
     def _predict_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
-        """Return the future tactile signals (window, horizon, channel) for the result of `_parts`."""
+        """Return the predicted tactile signals (window, horizon, channel) from the arrays that `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
-        read = ForecastWindows(
+        windows = ForecastWindows(
             *(torch.from_numpy(np.ascontiguousarray(array.swapaxes(0, 1))) for array in (latent, arm, finger))
         )
-        return self.decode_counts(self.features(read), touch[:, -1], latent[:, -1])
+        return self.decode_counts(self.features(windows), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
         """Raise an error for windows (window, context, channel) whose levels are far from rest.

@@ -271,7 +271,7 @@ def _test_windows(forecaster: Forecaster) -> list[ForecastWindows]:
     examples = []
     for number in range(TRACED):
         size = 0.0 if number == 0 else float(rng.lognormal(0, 1))
-        moved = rng.random((context, 1, 1)) < rng.random()  # the other rows repeat the previous row
+        moved = rng.random((context, 1, 1)) < rng.random()  # rows that are not moved repeat the previous row
         walk = WALK * rng.normal(0, size, (context, 1, len(forecaster.codec.latents))) * moved
         touch = walk.cumsum(axis=0) * forecaster.feature_half / 100
         arm = rng.normal(0, STEP * size, (rows, 1, ARM)).cumsum(axis=0)

@@ -15,7 +15,7 @@ from tacpipe.io.spill import Gathered, Spill
 from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import headline
-from tacpipe.tasks.forward.evaluation import KEPT_BYTES, band, check_rate
+from tacpipe.tasks.forward.evaluation import KEPT_BYTES, check_rate, model_quantiles
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.quantiles import CHUNK
@@ -54,14 +54,14 @@ def tables(
 def _collect_predictions(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
 ) -> dict[str, Gathered]:
-    """Return each recording's predictions, collected in batches of windows."""
+    """Return the predictions of each recording by name, computed in batches of windows. ``steps`` are counted from 1."""
     check_steps(steps, forecaster.horizon)
-    levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
+    level_indices = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
-    columns, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
+    step_indices, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
     spill, gathered = Spill(KEPT_BYTES), {}
-    none = np.zeros((len(steps), channels, 0), np.float32)
-    empty = prediction_table(forecaster, np.zeros(0, np.int64), none, steps, dict.fromkeys(quantiles, none))
+    no_windows = np.zeros((len(steps), channels, 0), np.float32)
+    empty = prediction_table(forecaster, np.zeros(0, np.int64), no_windows, steps, dict.fromkeys(quantiles, no_windows))
     for name, shard in sorted(recordings.recordings.items()):
         track = forecaster.track(shard)
         check_rate(track, forecaster)
@@ -69,14 +69,12 @@ def _collect_predictions(
         gathered[name] = Gathered(spill, empty)
         for forecast in forecasts(forecaster, track, starts):
             # (step, channel, window)
-            counts = forecast.count[:, columns].transpose(1, 2, 0).astype(np.float32, order="C")
-            bands = np.empty((len(levels), *counts.shape), np.float32)
-            for first in range(0, len(forecast.count) if levels else 0, CHUNK):
+            counts = forecast.count[:, step_indices].transpose(1, 2, 0).astype(np.float32, order="C")
+            bands = np.empty((len(level_indices), *counts.shape), np.float32)  # (level, step, channel, window)
+            for first in range(0, len(forecast.count) if level_indices else 0, CHUNK):
                 part = slice(first, min(first + CHUNK, len(forecast.count)))
-                quantiles_of_part = band(forecaster, track, forecast, part)[:, columns][..., levels].transpose(
-                    3, 1, 2, 0
-                )
-                bands[..., part] = quantiles_of_part
+                all_quantiles = model_quantiles(forecaster, track, forecast, part)
+                bands[..., part] = all_quantiles[:, step_indices][..., level_indices].transpose(3, 1, 2, 0)
             t_ns = track.t_ns[forecast.now]
             rows = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
             gathered[name].add(rows)

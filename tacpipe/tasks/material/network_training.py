@@ -110,7 +110,7 @@ def train_network(
         for part in (training_slides, validation_slides)
     )
     partners = _partners(params, len(config["classes"]))
-    _describe(config, shapes, scalings, held_out_materials, partners)
+    _add_networks(config, shapes, scalings, held_out_materials, partners)
     config["joint"] = joint
     pairs = _pairs(params, training, partners)
     work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
@@ -149,14 +149,14 @@ def _shape_json(shape: AutoencoderShape) -> StoredShape:
     }
 
 
-def _describe(
+def _add_networks(
     config: MaterialConfig,
     shapes: Mapping[str, AutoencoderShape],
     scalings: Mapping[str, Affine],
     held_out_materials: Mapping[str, set[int]],
     partners: Mapping[int, int] | None,
 ) -> None:
-    """Add the networks to a model's configuration."""
+    """Add the shapes, scalings, held-out materials and partner classes of the networks to ``config``."""
     config["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
     config["scaling"] = {
         name: {key: value.tolist() for key, value in scaling.to_tensors().items()} for name, scaling in scalings.items()

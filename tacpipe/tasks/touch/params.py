@@ -210,7 +210,7 @@ class Patches(PointNetwork):
     backbone: Literal["points", "edges"] = "points"  # points: each point separately; edges: with its neighbours
     radius_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0  # radius of the patch around a contact
     hidden: Annotated[int, Range(2)] = 256  # units of the first layer after the points
-    dropout: Dropout = 0.3  # fraction of these units dropped in each training step
+    dropout: Dropout = 0.3  # fraction of the ``hidden`` units dropped in each training step
     PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
 
     @property

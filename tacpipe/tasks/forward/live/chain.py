@@ -365,8 +365,8 @@ class LiveChain:
             return GridForecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
         ahead, lacking = self._planned_rows(row.t_ns)
         count = self._rolling.predict(ahead)
-        band = self._rolling.band(ahead, count)[..., self._quantiles] if self._quantiles else None
-        return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
+        quantiles = self._rolling.quantiles(ahead, count)[..., self._quantiles] if self._quantiles else None
+        return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=quantiles)
 
     def _take(self, row: _Row) -> bool:
         """Add a row to the model's window; return whether its values are finite."""

@@ -106,7 +106,7 @@ class MaterialReport(TaskReport):
         ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return the caveats of these numbers."""
+        """Return the caveats of the reported results; an empty list if there are no methods."""
         methods = context.methods
         return (
             [_basis(methods), _describe_pooling(methods), scores.caution(methods), _not_run(methods)] if methods else []

@@ -254,10 +254,11 @@ def _settings(run: MaterialResult) -> Settings:
 
 
 def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], known_fractions: list[float]) -> dict[str, str]:
-    """Return the number of training slides of a run if reduced, and the reduced sensors if not all are.
+    """Return how many training slides a run used if fewer than all (``few``), and which sensors, if not all (``few_of``).
 
-    Numbers are rounded to those of earlier runs with about as many slides; their fractions are stored in ``described``.
-    A sensor that learns from some batches only has all slides, because that is a separate setting.
+    A number is that of an earlier run with about as many slides, if there is one; ``known_fractions`` collects the
+    fractions of the other runs. A sensor that learns from only some batches counts as having all slides, because that
+    is a separate setting.
     """
     fewer = {}
     for sensor in ordered_sensors(run.trained):

@@ -41,7 +41,7 @@ def requested_grasps(record: Any) -> list[Grasp]:
 
 
 def requested_cloud(record: Any, folder: str, previous: Cloud | None) -> Cloud:
-    """Return the cloud of a request: its inline points, a file in ``folder``, or ``before``, the previous request's cloud.
+    """Return the cloud of a request: its inline points, a file in ``folder``, or ``previous``, the previous request's cloud.
 
     Raises `TacpipeError` if there is no cloud or it cannot be read.
     """
