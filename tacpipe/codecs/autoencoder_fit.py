@@ -204,7 +204,7 @@ def _record(network: NetworkShape, trained: loop.TrainingResult, *, kept: bool) 
 
 
 def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
-    """Return weight and bias of each layer of the ``encoder`` or ``decoder``; missing biases are zeros."""
+    """Return the weight and the bias of each layer of ``part``, encoder or decoder; missing biases are zeros."""
     tensors = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
     indices = sorted({int(name.split(".")[1]) for name in tensors})
     pairs = ((tensors[f"{part}.{at}.weight"], tensors.get(f"{part}.{at}.bias")) for at in indices)

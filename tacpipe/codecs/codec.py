@@ -231,11 +231,11 @@ def to_files(codec: FittedCodec) -> dict[str, bytes]:
     Raises `TacpipeError` if its kind is not its entry point, or its parts do not match.
     """
     files = dict(codec.to_files())
-    read = load(files)
-    if type(read) is not type(codec):
+    loaded = load(files)
+    if type(loaded) is not type(codec):
         raise TacpipeError(
             f"{type(codec).__name__} is of kind {codec.kind}, but the entry point of that name in {registry.CODECS} is "
-            f"{type(read).__name__}."
+            f"{type(loaded).__name__}."
         )
     package = registry.provider_of(registry.CODECS, codec.kind)
     if package is not None:

@@ -253,8 +253,8 @@ class Windows(torch.utils.data.Dataset[Window]):
     def _decode_recording(self, recording: Recording) -> _RecordingRows:
         table = recording.table(self.stream)
         t_ns = streams.times(table)
-        read = arrays.arrays_of_table(table)
-        inputs, targets = (_matching(patterns, read, recording.name) for patterns in self._patterns)
+        all_columns = arrays.arrays_of_table(table)
+        inputs, targets = (_matching(patterns, all_columns, recording.name) for patterns in self._patterns)
         if self._channels is None:
             self._channels = inputs, targets
         names = tuple(dict.fromkeys((*inputs, *targets)))
@@ -264,7 +264,7 @@ class Windows(torch.utils.data.Dataset[Window]):
                 f"Recording {recording.name} does not have the same channels as the others, or lacks one: {odd[0]}. "
                 f"Name the columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
             )
-        matrix = arrays.Arrays(read.by_column, names)
+        matrix = arrays.Arrays(all_columns.by_column, names)
         if self.rest_s is None:
             values = _matrix(matrix, self.dtype, recording.name)
         else:

@@ -54,7 +54,7 @@ def call(
         fields.check(getattr(options, flag), kind, flag)
     _refuse_unread(name, stage, datasets, arguments, options)
     paths = {key: _path(dataset) for key, dataset in arguments.items()}
-    read = [_path(dataset) for dataset in datasets]
+    dataset_paths = [_path(dataset) for dataset in datasets]
     request = Request(
         name,
         given_params.build(
@@ -66,8 +66,8 @@ def call(
             options=params,
         ),
         Path(output),
-        datasets=[] if stage.source else read,
-        source=read[0] if stage.source else None,
+        datasets=[] if stage.source else dataset_paths,
+        source=dataset_paths[0] if stage.source else None,
         fold=options.fold,
         role=options.role,
         jobs=options.jobs,

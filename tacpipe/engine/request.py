@@ -126,13 +126,13 @@ class RequestInputs:
         """Return sentences about files below the source that are not part of a recording."""
         if self.request.source is None or not self.sources:
             return []
-        read = {path for source in self.sources.values() for path in source.files.values()}
+        read_paths = {path for source in self.sources.values() for path in source.files.values()}
         if self.stage.why_unread is not None:
             reason = self.stage.why_unread(self.request.params, self.request.source)
         else:
             command = self.request.name.replace(".", " ")
             reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
-        return container.describe_unread(self.request.source, read, reason, self.request.output)
+        return container.describe_unread(self.request.source, read_paths, reason, self.request.output)
 
     def plan(self) -> ResultPlan:
         """Return the properties of the result that are known before it is computed."""

@@ -191,12 +191,12 @@ class XdfFile:
         return EpisodeContents(chosen, attributes, skipped, notes)
 
     def _read(self) -> _FileReading:
-        read = _FileReading()
+        reading = _FileReading()
         try:
             content = _open_content(self.path)
             passed = 0  # bytes since pages were last released
             for chunk in xdf_chunks.read_chunks(content):
-                _add_chunk(read, chunk, self.path)
+                _add_chunk(reading, chunk, self.path)
                 if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
                     content.madvise(
                         mmap.MADV_DONTNEED, passed, PASSED_BYTES
@@ -208,7 +208,7 @@ class XdfFile:
             raise
         except TacpipeError as error:
             raise TacpipeError(f"{self.path} is not an XDF file: {error}.") from error
-        return read
+        return reading
 
 
 def _open_content(path: Path) -> xdf_chunks.Content:

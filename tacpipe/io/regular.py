@@ -97,11 +97,11 @@ def blocks(path: Path | str, max_bytes: int, *, follow: bool = True) -> Iterator
     """Yield a regular file of at most ``max_bytes`` in pieces of `BLOCK_BYTES`. Raises the errors of `content`."""
     handle, size = _open(path, follow=follow)
     try:
-        read = 0
+        total = 0
         _expect_size(path, size, max_bytes, in_memory=False)
         while block := os.read(handle, BLOCK_BYTES):
-            read += len(block)
-            _expect_size(path, read, max_bytes, in_memory=False)
+            total += len(block)
+            _expect_size(path, total, max_bytes, in_memory=False)
             yield block
     finally:
         os.close(handle)

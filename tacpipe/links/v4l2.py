@@ -124,7 +124,7 @@ class V4l2Device:
 
 def cameras() -> list[Port]:
     """Return the cameras of this computer that capture video."""
-    found = []
+    ports = []
     for path in files.listed(SYSFS):
         with contextlib.suppress(OSError):
             device = V4l2Device(str(DEVICES / path.name))
@@ -133,8 +133,8 @@ def cameras() -> list[Port]:
             finally:
                 device.close()
             if captures:
-                found.append(Port(f"v4l2:{DEVICES / path.name}", "", f"{card} on {bus}", f"v4l2:{card}"))
-    return found
+                ports.append(Port(f"v4l2:{DEVICES / path.name}", "", f"{card} on {bus}", f"v4l2:{card}"))
+    return ports
 
 
 def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:

@@ -73,7 +73,7 @@ class LargestOverPoints(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return the maxima."""
+        """Return the maxima (cloud, output) for ``weight`` (output, input) and ``bias`` (output,)."""
         largest, indices = (_largest_product_cached if points.device.type == "cpu" else _largest_product)(
             points, weight
         )
@@ -82,7 +82,7 @@ class LargestOverPoints(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the gradients, which are nonzero only at the points of the maxima."""
+        """Return the gradients of points, weight and bias; that of points is nonzero only at the maxima."""
         points, weight, indices = ctx.saved_tensors
         (gradient,) = gradients
         at = (indices + torch.arange(len(indices), device=indices.device)[:, None] * points.shape[1]).ravel()
@@ -110,7 +110,7 @@ def _largest_product(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _largest_product_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the same, one cloud at a time, so that products stay in the cache, with numpy's faster argmax."""
+    """Return the result of `_largest_product`, computed per cloud so that products fit the cache, with numpy's argmax."""
     products = points.new_empty(len(weight), points.shape[1])  # (output, point)
     largest = points.new_empty(len(points), len(weight))
     indices = torch.empty(largest.shape, dtype=torch.long)
@@ -175,7 +175,10 @@ class PatchNetwork(nn.Module):
         )
 
     def forward(self, patches: Tensor, numbers: Tensor) -> Tensor:
-        """Return the values of touch. The patches are those around g1, around g2, and the whole cloud."""
+        """Return the values of touch (cloud, value) from patches (cloud, patch, point, channel) and numbers (cloud, number).
+
+        The patches are those around g1, around g2, and the whole cloud.
+        """
         clouds, _, points, channels = patches.shape
         near = self.near(patches[:, :2].reshape(-1, points, channels)).view(clouds, -1)
         values: Tensor = self.head(torch.cat([near, self.whole(patches[:, 2]), numbers], dim=1))
@@ -193,7 +196,7 @@ class PointBackbone(nn.Module):
         )
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the features."""
+        """Return the features (cloud, 512) of points (cloud, point, channel)."""
         return _pool(self.layers(points))
 
 
@@ -207,7 +210,7 @@ class EdgeBackbone(nn.Module):
         self.layers = nn.Sequential(nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, last))
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the features. Neighbours are found by the first three channels, the position."""
+        """Return the features (cloud, 512) of points (cloud, point, channel), whose first channels are x, y and z."""
         clouds, count, channels = points.shape
         distances = torch.cdist(points[:, :, :3], points[:, :, :3])
         nearest = distances.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
@@ -248,7 +251,7 @@ class PointNet(nn.Module):
         self.head = _fully_connected(FEATURES + grasp, head, outputs)
 
     def forward(self, points: Tensor, grasp: Tensor) -> Tensor:
-        """Return the values of touch."""
+        """Return the values of touch (cloud, value)."""
         if self.transform is not None:
             points = points @ self.transform(points)
         values: Tensor = self.head(torch.cat([self.points(points), grasp], dim=1))
@@ -265,7 +268,7 @@ class PointFeatures(nn.Module):
         self.last = NormalisedLinear(sizes[-1], FEATURES)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the features; the last layer has no ReLU."""
+        """Return the features (cloud, 1024); the last layer has no ReLU."""
         for layer in self.layers:
             points = torch.relu(layer(points))
         return largest_output(self.last, points)
@@ -284,7 +287,7 @@ class PointTransform(nn.Module):
         self.head = _fully_connected(FEATURES, TRANSFORM_LAYERS, channels * channels)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Return the matrix by which points are multiplied from the right."""
+        """Return the matrix (cloud, channel, channel) by which points are multiplied from the right."""
         transform: Tensor = self.head(torch.relu(self.points(points))).view(-1, self.channels, self.channels)
         return transform + torch.eye(self.channels, device=points.device)
 

@@ -38,11 +38,11 @@ class Identity(nn.Module):
         self.width = channels
 
     def encode(self, frames: Tensor) -> Tensor:
-        """Return the frames."""
+        """Return the frames (time, slide, channel) as features."""
         return frames
 
     def decode(self, features: Tensor) -> Tensor:
-        """Return the features."""
+        """Return the features (time, slide, channel) as frames."""
         return features
 
 
@@ -59,11 +59,11 @@ class Perceptron(nn.Module):
         self.encoder, self.decoder = nn.Linear(channels, WIDTH), nn.Linear(WIDTH, channels)
 
     def encode(self, frames: Tensor) -> Tensor:
-        """Return the features."""
+        """Return the features (time, slide, width) of frames (time, slide, channel)."""
         return torch.tanh(self.encoder(frames))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Return the frames."""
+        """Return the frames (time, slide, channel) of features (time, slide, width)."""
         frames: Tensor = self.decoder(features)
         return frames
 
@@ -94,7 +94,7 @@ class Convolution(nn.Module):
         self._indices: Tensor | None = None
 
     def encode(self, frames: Tensor) -> Tensor:
-        """Return the features."""
+        """Return the features (time, slide, width) of frames (time, slide, channel)."""
         steps, slides, _ = frames.shape
         maps = self.encoder(frames.reshape(-1, 1, *GRID))  # (time * slide, map, 4, 6)
         if self.unpool == "last":
@@ -106,7 +106,7 @@ class Convolution(nn.Module):
         return features
 
     def decode(self, features: Tensor) -> Tensor:
-        """Return the frames."""
+        """Return the frames (time, slide, channel) of features (time, slide, width)."""
         steps, slides, _ = features.shape
         pooled = features.reshape(-1, MAPS, 2, 3)
         if self.unpool == "last":

@@ -160,10 +160,10 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
 
     sensor = rig.streams[name].sensor
     decoded, stalls = Decoded(sensor.fields(), spill or Spill(MEMORY_BYTES)), Stalls()
-    read = _read(_joined_blocks(spooled, name), sensor, decoded, stalls)
+    account = _read(_joined_blocks(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
-    events = read.events + _silent_end(sensor, last_ns, end_ns)
-    crashed = _count_unspooled(spooled, name, read.chunks, read.bytes)
+    events = account.events + _silent_end(sensor, last_ns, end_ns)
+    crashed = _count_unspooled(spooled, name, account.chunks, account.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         events.append(StreamFault(last_ns, CRASH, bytes=crashed[1], detail=detail))
@@ -176,8 +176,8 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
         (stamping.utc_ns(decoded.first_ns), stamping.utc_ns(decoded.last_ns)) if decoded.count else None,
         events,
         sum(event.frames for event in events),
-        received=read.bytes,
-        undecoded=read.undecoded,
+        received=account.bytes,
+        undecoded=account.undecoded,
         crashed=crashed,
         uncertain=late,
     )

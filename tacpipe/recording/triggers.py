@@ -52,10 +52,10 @@ def keys() -> Iterator[Keys]:
     def pressed(*, must: bool = False) -> bool:
         nonlocal typed, closed
         if not closed and select.select([source], [], [], 0)[0]:
-            read = b""
+            received = b""
             with contextlib.suppress(OSError):  # the terminal was closed, so no key can be pressed
-                read = os.read(source, 4096)  # sys.stdin would buffer bytes that select does not see
-            typed, closed = typed + read, not read
+                received = os.read(source, 4096)  # sys.stdin would buffer bytes that select does not see
+            typed, closed = typed + received, not received
         count, is_pressed = _find_key(typed, lines=settings is None)
         typed = typed[count:]
         if must and closed and not is_pressed:

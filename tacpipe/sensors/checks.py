@@ -108,7 +108,7 @@ def _contributions(kind: CrcKind, polynomial: int, bits: int, count: int) -> NDA
 
 
 def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return table and step of a CRC with the least significant bit first."""
+    """Return the table (256,) of a CRC with the least significant bit first, and the function that updates the CRC."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(polynomial), table >> 1)
@@ -116,7 +116,7 @@ def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step
 
 
 def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return table and step of a CRC with the most significant bit first."""
+    """Return the table (256,) of a CRC with the most significant bit first, and the function that updates the CRC."""
     mask = np.uint32((1 << bits) - 1)
     table = np.arange(256, dtype=np.uint32) << np.uint32(bits - 8)
     for _ in range(8):
@@ -130,7 +130,7 @@ def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Ste
 
 
 def _mixed_table(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return the table of `_high_bit_first` with the step of `_low_bit_first`."""
+    """Return the table of `_high_bit_first` and the update function of `_low_bit_first`."""
     return _high_bit_first(polynomial, bits)[0], _step_low_bit_first
 
 

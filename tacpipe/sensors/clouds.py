@@ -90,7 +90,10 @@ class Clouds(Sensor):
 
 @functools.lru_cache(maxsize=CACHED)
 def _parse(content: bytes) -> tuple[Float32s, Bytes | None]:
-    """Return points and colours of a chunk. Raises `TacpipeError` if it is not a cloud."""
+    """Return the points (point, xyz) of a chunk, and their colours (point, rgb) or None.
+
+    Raises `TacpipeError` if it is not a cloud.
+    """
     if content.startswith(MAGIC):
         return DepthFrame.from_bytes(content).points()
     if content.startswith(b"ply"):

@@ -101,7 +101,7 @@ class ScanFramer:
         return np.where(good, positions, -1)
 
     def _scans(self, positions: Int64s, t_ns: Times) -> tuple[Int64s, int | None]:
-        """Return the first rows of complete scans, and of an incomplete last scan, or None."""
+        """Return the first row of each complete scan, and that of an incomplete last scan, or None if there is none."""
         starts = np.flatnonzero(positions == 0)
         if not len(starts):
             return starts, None

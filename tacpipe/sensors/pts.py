@@ -202,7 +202,10 @@ class _Tables:
         return list(itertools.pairwise(edges))
 
     def values(self, block: int, start: int, stop: int) -> tuple[int, ...]:
-        """Return the offset of the values of each entry of the table at ``start``."""
+        """Return the offset of the values of each entry of the table from ``start`` to ``stop``.
+
+        Raises `_NoLayoutError` if an entry does not have the size and the kind of ``block``.
+        """
         spans = self.spans(start, stop)
         for begin, end in spans:
             _require(end - begin == 2 + SIZES[block] and self.number(begin) == KINDS[block])

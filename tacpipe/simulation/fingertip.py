@@ -52,8 +52,8 @@ def leans() -> Floats:
     return lean
 
 
-def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
-    """Return the logged electrode counts (time, electrode): with rest level, noise and drift, rounded, tare, absolute."""
+def simulate_counts(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Counts:
+    """Return the logged counts (time, electrode) for a signal: with rest level, noise and drift, rounded and tared."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
     rest_counts = rng.uniform(*REST_COUNT, signal.shape[1])

@@ -43,7 +43,7 @@ class Sensors:
     phases_rad: Floats  # (period, finger, channel)
 
 
-def sensors(rng: np.random.Generator) -> Sensors:
+def draw_sensors(rng: np.random.Generator) -> Sensors:
     """Return two random sensors."""
     fingers, electrodes = len(biotac_sp.FINGERS), biotac_sp.ELECTRODES
     rest_counts = np.column_stack([rng.uniform(*REST_COUNT, (fingers, electrodes)), PRESSURE_COUNT])

@@ -51,8 +51,8 @@ def leans(patch_m: Floats) -> Floats:
     return lean
 
 
-def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
-    """Return the logged taxels (time, taxel): with noise and drift, reduced by the dead zone, and clipped."""
+def simulate_taxels(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
+    """Return the logged taxels (time, taxel) for a signal: with noise and drift, less the dead zone, and clipped."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
     counts: Float32s = (signal + noise_scale * noise - DEAD_COUNT).clip(0, MAX_COUNT).astype(np.float32)

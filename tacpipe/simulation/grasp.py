@@ -154,7 +154,7 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
     streams = {"grasp": scene.grasp.table(t_ns)}
     moments_ns: dict[str, int] = {}
     if rig.raw:
-        course = pinch.course(t_ns, rng)
+        course = pinch.draw_course(t_ns, rng)
         neighbour = draw_object(seed, index + 1 + int(rng.integers(1_000)), rig)
         view = depth_camera.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
         streams |= depth_camera.tables(view)

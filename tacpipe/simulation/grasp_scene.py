@@ -54,12 +54,12 @@ def draw_household_object(rng: np.random.Generator, family: str, number: int, st
         raise TacpipeError(f"There is no family {family!r}; the families are {', '.join(FAMILIES)}.")
     if stiffness not in (*MODULI_PA, "mixed"):
         raise TacpipeError(f"There is no stiffness {stiffness!r}; give mixed, {', '.join(MODULI_PA)}.")
-    drawn = str(rng.choice(list(MODULI_PA), p=SHARES))
-    shape = _shape(family, rng)
-    return Thing(f"{family}-{number:02d}", family, shape, drawn if stiffness == "mixed" else stiffness)
+    random_stiffness = str(rng.choice(list(MODULI_PA), p=SHARES))
+    shape = _draw_shape(family, rng)
+    return Thing(f"{family}-{number:02d}", family, shape, random_stiffness if stiffness == "mixed" else stiffness)
 
 
-def _shape(family: str, rng: np.random.Generator) -> Shape:
+def _draw_shape(family: str, rng: np.random.Generator) -> Shape:
     """Return a random body of a family with widths between about 20 and 120 mm."""
 
     def between(*limits_mm: tuple[float, float]) -> list[float]:
@@ -230,8 +230,8 @@ def draw_object(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
     """Return the object of trial ``index``. With ``rig.spheres``, all trials have the same object."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
-        drawn = draw_household_object(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
-        return replace(drawn, name="spheres", shape=Ellipsoid(np.full(3, REFERENCE_M)))
+        sphere = draw_household_object(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
+        return replace(sphere, name="spheres", shape=Ellipsoid(np.full(3, REFERENCE_M)))
     names = families(rig)
     number, kind = divmod(index % (len(names) * rig.objects), len(names))
     rng = np.random.default_rng([seed, THINGS, FAMILIES.index(names[kind]), number])
@@ -240,7 +240,7 @@ def draw_object(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
 
 def sensors(seed: int) -> fingertip_sp.Sensors:
     """Return the two sensors of the rig with this seed."""
-    return fingertip_sp.sensors(np.random.default_rng([seed, SENSORS]))
+    return fingertip_sp.draw_sensors(np.random.default_rng([seed, SENSORS]))
 
 
 def perform(seed: int, index: int, rig: GraspRig = GraspRig()) -> GraspScene:

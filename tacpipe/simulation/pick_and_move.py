@@ -158,24 +158,24 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
         path = trajectory.rest(rig.duration_s)
         closing, squeeze = np.ones(len(path.t_ns)), np.ones(len(path.t_ns))
     else:
-        path = trajectory.trajectory(protocol, rig.duration_s, approach_s + RAMP_S + pause_s, rng)
+        path = trajectory.draw_trajectory(protocol, rig.duration_s, approach_s + RAMP_S + pause_s, rng)
         closing = _ease(path.t_ns / 1e9 / approach_s)
         squeeze = _ease((path.t_ns / 1e9 - approach_s) / RAMP_S)
     mass_kg = float(MASSES_KG[rng.integers(len(MASSES_KG))])
     load_n = np.linalg.norm(
         mechanics.HeldObject(mass_kg, 1.0, squeeze).demand_n(path.hand_acceleration_m_s2)[:, ::2], axis=1
     )
-    grip_n, friction = _grip(mass_kg, float(load_n.max()), rig.effort, rng)
+    grip_n, friction = _draw_grip(mass_kg, float(load_n.max()), rig.effort, rng)
     grasp = mechanics.HeldObject(mass_kg, friction * rig.friction_scale, grip_n * squeeze, rig.lever_m)
     loss_ns = None
     if rng.random() < rig.grip_loss_probability:
-        row = _loss_row(load_n, grasp, path.rise_m, rig.grip_loss, rng)
+        row = _draw_loss_row(load_n, grasp, path.rise_m, rig.grip_loss, rng)
         loss_ns = int(path.t_ns[row])
         weaker = 1 - rig.grip_loss * _ease((path.t_ns - loss_ns) / 1e9 / LOSS_S)
         grasp = mechanics.HeldObject(mass_kg, grasp.friction, grasp.grip_n * weaker, rig.lever_m)
     rise_m = None if rig.still else path.rise_m
     contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
-    skins = (taxels.skin(rng), taxels.skin(rng))
+    skins = (taxels.draw_skin(rng), taxels.draw_skin(rng))
     return PickScene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
 
 
@@ -225,12 +225,12 @@ def _measurement(
     skin = scene.skins[finger]
     force = touch(scene, finger, true_ns, creep=0.0 if rig.still else taxels.CREEP)
     drift_scale = 0.0 if rig.still else rig.noise_scale
-    errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
+    errors = taxels.draw_errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
     counts = taxels.digitise(skin.base_count + taxels.signal(skin, force) + errors)
     return faults.hold(counts, rig.hold_probability, rng)[0].__getitem__, schema.uskin_fields()
 
 
-def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
+def _draw_grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
     """Return a random grip force and friction that hold the weight, or with which ``load_n`` is ``effort`` of the limit.
 
     The grip is outside of `GRIP_N` if effort, mass and plan require it.
@@ -246,7 +246,7 @@ def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator
             return grip_n, friction
 
 
-def _loss_row(
+def _draw_loss_row(
     load_n: Floats, grasp: mechanics.HeldObject, rise_m: Floats, loss: float, rng: np.random.Generator
 ) -> int:
     """Return a random row for a loss of grip while the hand is lifted and after which the load exceeds friction.

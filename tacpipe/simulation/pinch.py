@@ -178,7 +178,7 @@ class PinchCourse:
     moments_ns: dict[str, int]  # contact: first touch; hold: full force; release: start of its decrease
 
 
-def course(start_ns: int, rng: np.random.Generator) -> PinchCourse:
+def draw_course(start_ns: int, rng: np.random.Generator) -> PinchCourse:
     """Return a course that starts at ``start_ns`` and whose phases have random durations."""
     free_s, closing_s, held_s = (float(rng.uniform(*limits)) for limits in (FREE_S, CLOSING_S, HELD_S))
     knots_s = np.cumsum([free_s, closing_s, held_s, RELEASE_S])

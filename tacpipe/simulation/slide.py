@@ -135,7 +135,7 @@ def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> Recordi
         if rig.arm_every and scene.trial.number % rig.arm_every == 0:
             streams |= _arm(scene, start_ns, rig, rng)
     else:
-        taxels = forearm.read(signal, rig.noise_scale, rng)
+        taxels = forearm.simulate_taxels(signal, rig.noise_scale, rng)
         note = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
         streams["roboskin"] = schema.stream(start_ns + scene.true_ns, taxels.T, schema.roboskin_fields(), note)
     streams["truth"] = _truth(scene, start_ns)
@@ -147,7 +147,7 @@ def perform(seed: int, index: int, rig: SlideRig = SlideRig()) -> SlideScene:
     trial = slide_trial(index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
     surface_material = material(seed, trial.sensor, trial.material, rig)
-    surface = texture.track(surface_material, rng)
+    surface = texture.draw_surface(surface_material, rng)
     force_n = rig.force_n * (1 + FORCE_SPREAD * float(rng.normal()))
     if trial.sensor == "biotac":
         return _biotac_scene(trial, surface_material, surface, force_n, rig, rng)
@@ -272,7 +272,7 @@ def _arm_motion(
 
 def _finger(scene: SlideScene, signal: Floats, rig: SlideRig, rng: np.random.Generator) -> list[Any]:
     """Return the 44 columns (time,) of the stream biotac."""
-    electrodes = fingertip.read(signal, rig.noise_scale, rng)
+    electrodes = fingertip.simulate_counts(signal, rig.noise_scale, rng)
     touched = scene.true_ns[int((scene.force_n > 0).argmax())]
     tdc, tac = fingertip.warmth((scene.true_ns - touched) / 1e9, rig.noise_scale, rng)
     pac = np.zeros((len(signal), schema.VIBRATIONS), np.uint16)

@@ -50,7 +50,7 @@ class Skin:
     base_count: Floats  # (taxel, axis)
 
 
-def skin(rng: np.random.Generator) -> Skin:
+def draw_skin(rng: np.random.Generator) -> Skin:
     """Return a random skin."""
     mixing = np.eye(3) + OFF_AXIS * rng.uniform(-1, 1, (schema.TAXELS, 3, 3))
     base = np.array(BASE_COUNT) + rng.uniform(-BASE_SPREAD_COUNT, BASE_SPREAD_COUNT, (schema.TAXELS, 3))
@@ -137,7 +137,7 @@ def lag(values: Floats, rate_hz: float) -> Floats:
     return late
 
 
-def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.Generator) -> Floats:
+def draw_errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.Generator) -> Floats:
     """Return noise plus drift in counts (time, taxel, axis) for samples at ``at_s`` (time,)."""
     shape = (len(at_s), schema.TAXELS, 3)
     steps_s = np.diff(at_s, prepend=at_s[:1])

@@ -70,8 +70,8 @@ def draw_material(rng: np.random.Generator) -> Material:
     )
 
 
-def track(material: Material, rng: np.random.Generator) -> Waves:
-    """Return the surface of one trial on a material."""
+def draw_surface(material: Material, rng: np.random.Generator) -> Waves:
+    """Return the surface of one trial on a material: its worn and stretched gratings, and a random background."""
     edges = _edges(WAVES)
     number = rng.uniform(edges[:-1], edges[1:])
     size, phase = rng.rayleigh(1.0, WAVES), rng.uniform(0, 2 * np.pi, GRATINGS + WAVES)

@@ -67,7 +67,7 @@ class Trajectory:
         return np.column_stack([cos * x + sin * y, cos * y - sin * x, z])
 
 
-def trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.Generator) -> Trajectory:
+def draw_trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.Generator) -> Trajectory:
     """Return a random trajectory of a protocol whose lift starts at ``first_s``.
 
     Raises `TacpipeError` for an unknown protocol, or if the trial is too short for the lift.
@@ -77,7 +77,9 @@ def trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.
     if duration_s < first_s + AFTER_LIFT_S:
         raise TacpipeError(f"A trial of {duration_s} s ends before its lift; duration_s must be 4 s or more.")
     rows, first = round(duration_s * RATE_HZ) + 1, round(first_s * RATE_HZ)
-    path = controlled(rows, first, rng) if protocol == "controlled" else kinaesthetic(rows, first, rng)
+    path = (
+        draw_controlled_path(rows, first, rng) if protocol == "controlled" else draw_kinaesthetic_path(rows, first, rng)
+    )
     since_s = _times_s(rows) - first_s
     yaw = rng.uniform(0.05, 0.3) * np.clip(since_s, 0.0, 1.0) * np.sin(2 * np.pi * since_s / rng.uniform(4.0, 8.0))
     return Trajectory(_stamps(rows), path + START_M, yaw)
@@ -89,14 +91,14 @@ def rest(duration_s: float) -> Trajectory:
     return Trajectory(_stamps(rows), np.tile(np.add(START_M, (0.0, 0.0, BOX_M[2][0])), (rows, 1)), np.zeros(rows))
 
 
-def controlled(rows: int, first: int, rng: np.random.Generator) -> Floats:
+def draw_controlled_path(rows: int, first: int, rng: np.random.Generator) -> Floats:
     """Return a path of the controlled protocol that starts in row ``first`` (time, axis), in metres from the start."""
     acceleration = smooth(_trapezoids(rows, first, rng))
     path: Floats = np.cumsum(np.cumsum(acceleration, axis=0), axis=0) / RATE_HZ**2
     return path
 
 
-def kinaesthetic(rows: int, first: int, rng: np.random.Generator) -> Floats:
+def draw_kinaesthetic_path(rows: int, first: int, rng: np.random.Generator) -> Floats:
     """Return a path of the kinaesthetic protocol that starts in row ``first`` (time, axis), in metres from the start."""
     path = np.zeros((rows, 3))
     low, high = np.array(BOX_M).T

@@ -183,7 +183,7 @@ def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> Ti
 def _convert_device_times(
     recording: str, stream: str, columns: Columns, arrival_ns: Times
 ) -> tuple[Int64s, dict[str, Attribute]]:
-    """Return the device times of samples converted to the host's clock, and attributes of the fit."""
+    """Return the device times (time,) in ns of samples, converted to the host's clock, and attributes of the fit."""
     import pyarrow as pa
 
     from tacpipe.arrays import from_arrow
@@ -208,7 +208,7 @@ def _convert_device_times(
 
 
 def _certain(columns: Columns) -> Bools | None:
-    """Return a mask of the rows whose arrival was not delayed, or None for all."""
+    """Return a mask (time,) of the rows whose arrival was not delayed, or None if none was delayed."""
     from tacpipe.arrays import from_arrow
 
     if UNCERTAIN not in columns.column_names:
@@ -218,7 +218,7 @@ def _certain(columns: Columns) -> Bools | None:
 
 
 def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
-    """Return the arrival times of a stream. Raises `TacpipeError` if there are none, or they decrease."""
+    """Return the arrival times (time,) in ns of a stream. Raises `TacpipeError` if there are none, or they decrease."""
     import numpy as np
 
     from tacpipe.arrays import from_arrow

@@ -28,7 +28,7 @@ _DIVERGING = ("#7cc4ff", "#2f7fd0", "#2b3040", "#e07b39", "#ffd08a")  # below, a
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Parse a colour ``#rrggbb``."""
+    """Return red, green and blue, 0 to 255, of a colour ``#rrggbb``."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 

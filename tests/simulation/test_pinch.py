@@ -16,7 +16,7 @@ from tests.simulation.solids import CONE, CYLINDER
 
 FLAT = Situation(0.06, np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)), 0.0)
 NOTHING = Unseen(np.ones((1, 2)), np.full(1, 0.01), np.zeros((1, 2, 2)), np.zeros((1, 2, 2)), np.full(1, 0.004))
-MADE = fingertip_sp.sensors(np.random.default_rng(1))
+MADE = fingertip_sp.draw_sensors(np.random.default_rng(1))
 
 
 def noiseless_readings(situation: Situation, force_n: np.ndarray) -> np.ndarray:

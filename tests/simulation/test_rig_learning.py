@@ -154,7 +154,7 @@ def acceleration_forecast() -> Any:
 def flight(index: int) -> tuple[AnyFloats, AnyFloats]:
     """Return the exact inputs of a random trajectory in the air at each row, and the next change of acceleration."""
     rng = np.random.default_rng([7, index])
-    path = trajectory.trajectory(trajectory.PROTOCOLS[index % 2], 12.0, 1.5, rng)
+    path = trajectory.draw_trajectory(trajectory.PROTOCOLS[index % 2], 12.0, 1.5, rng)
     stride = round(ROW_NS * trajectory.RATE_HZ / 1e9)
     position, acceleration = path.position_m[::stride], path.acceleration_m_s2[::stride]
     now = np.arange(1_500 // stride + 10, len(position) - HORIZON)

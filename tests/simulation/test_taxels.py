@@ -11,7 +11,7 @@ RNG = np.random.default_rng(8)
 
 
 def skin() -> taxels.Skin:
-    return taxels.skin(np.random.default_rng(4))
+    return taxels.draw_skin(np.random.default_rng(4))
 
 
 def test_the_shares_of_the_pressure_add_up_to_one_wherever_the_object_is() -> None:
@@ -83,8 +83,8 @@ def test_what_creeps_follows_by_a_first_order_lag() -> None:
 
 def test_noise_is_white_and_drift_a_random_walk() -> None:
     at_s = np.arange(0, 400, 0.02)
-    noise = taxels.errors(at_s, 1.0, 0.0, np.random.default_rng(1))
+    noise = taxels.draw_errors(at_s, 1.0, 0.0, np.random.default_rng(1))
     np.testing.assert_allclose(noise.std(axis=(0, 1)), taxels.NOISE_COUNT, rtol=0.01)
     assert abs(np.corrcoef(noise[1:, 0, 0], noise[:-1, 0, 0])[0, 1]) < 0.02
-    drift = taxels.errors(at_s, 0.0, 1.0, np.random.default_rng(1))
+    drift = taxels.draw_errors(at_s, 0.0, 1.0, np.random.default_rng(1))
     assert (drift[50:] - drift[:-50]).std() == pytest.approx(taxels.DRIFT_COUNT, rel=0.05)

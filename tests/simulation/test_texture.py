@@ -42,7 +42,7 @@ def test_the_power_that_is_felt_over_many_tracks_is_that_of_the_spectrum(sigma_m
     sample = material(3)
     rng = np.random.default_rng(0)
     at_m = np.arange(0, 0.3, 0.0005)
-    power = [np.mean(texture.contact_force(texture.track(sample, rng), at_m, sigma_m) ** 2) for _ in range(100)]
+    power = [np.mean(texture.contact_force(texture.draw_surface(sample, rng), at_m, sigma_m) ** 2) for _ in range(100)]
     _, expected = texture.spectrum(sample, sigma_m)
     worn = np.exp(2 * texture.WEAR**2)  # mean square of what is log-normal
     assert np.mean(power) == pytest.approx(expected[:3].sum() * worn + expected[3:].sum(), rel=0.12)
@@ -61,8 +61,8 @@ def test_the_power_of_a_background_falls_with_the_wave_number_to_the_exponent() 
 def test_two_tracks_of_a_material_differ_and_the_same_numbers_give_the_same_track() -> None:
     at_m = np.arange(0, 0.1, 0.001)
     rng = np.random.default_rng(7)
-    first, second = (texture.contact_force(texture.track(material(), rng), at_m, 0.0006) for _ in range(2))
-    repeat = texture.contact_force(texture.track(material(), np.random.default_rng(7)), at_m, 0.0006)
+    first, second = (texture.contact_force(texture.draw_surface(material(), rng), at_m, 0.0006) for _ in range(2))
+    repeat = texture.contact_force(texture.draw_surface(material(), np.random.default_rng(7)), at_m, 0.0006)
     assert np.abs(first - second).mean() > 0.1 * first.std()
     np.testing.assert_array_equal(first, repeat)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.simulation.trajectory import JERK_S, RATE_HZ, Trajectory, minimum_jerk, rest, smooth, trajectory
+from tacpipe.simulation.trajectory import JERK_S, RATE_HZ, Trajectory, draw_trajectory, minimum_jerk, rest, smooth
 
 
 def path(protocol: str, seed: int, duration_s: float = 20.0) -> Trajectory:
-    return trajectory(protocol, duration_s, 1.5, np.random.default_rng(seed))
+    return draw_trajectory(protocol, duration_s, 1.5, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("protocol", ["controlled", "kinaesthetic"])

@@ -55,9 +55,9 @@ class Episode:
 
 def find_episodes(tree: Tree) -> list[Episode]:
     """Return the recordings of a tree in order, by number if names contain one. Raises `TacpipeError`."""
-    cut = _episodes_from_ends(tree)
-    if cut:
-        return cut
+    episodes = _episodes_from_ends(tree)
+    if episodes:
+        return episodes
     groups: list[str] = []
     for group in tree.members("")[1]:  # the groups of recordings are here or one level below
         groups += [group] if _is_numbered(group) else filter(_is_numbered, tree.members(group)[1])
@@ -84,11 +84,11 @@ def find_episode(tree: Tree, name: str | None) -> Episode:
         if others or episode.name is not None:
             raise TacpipeError(f"{tree.path} holds {len(others) + 1} recordings. Name one of them.")
         return episode
-    cut = _episodes_from_ends(tree)
-    for episode in cut:
+    delimited = _episodes_from_ends(tree)
+    for episode in delimited:
         if episode.name == name:
             return episode
-    for group in ["", *(tree.members("")[1] if "/" not in name else ())] if not cut else ():
+    for group in ["", *(tree.members("")[1] if "/" not in name else ())] if not delimited else ():
         path = f"{group}/{name}" if group else name
         if tree.is_group(path):
             return Episode(name, path)

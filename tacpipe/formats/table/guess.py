@@ -70,7 +70,7 @@ def guess_layout(folder: Path) -> str:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
     trees = _label_files(folder, [path for path in all_paths if path.suffix.lower() in TREES], groups)
     in_groups = [*(group.paths for group in [*groups, *stamps, *labels]), *trees.values()]
-    read = [folder / path for paths in [*in_groups, *(group.members for group in groups)] for path in paths]
+    read_files = [folder / path for paths in [*in_groups, *(group.members for group in groups)] for path in paths]
 
     def reason(path: str) -> str:
         return damaged.get(path) or why_unreadable(
@@ -85,7 +85,7 @@ def guess_layout(folder: Path) -> str:
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
-        *(f"# {shown(line)}" for line in container.describe_unread(folder, read, reason)),
+        *(f"# {shown(line)}" for line in container.describe_unread(folder, read_files, reason)),
     ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 

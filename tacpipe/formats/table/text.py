@@ -130,11 +130,11 @@ class TextTable:
         """Yield the columns in ``types`` block by block. Raises `TacpipeError` with the line of an invalid row."""
         names = self.names()
         parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
-        read = pc.ReadOptions(column_names=names, use_threads=True)
+        read_options = pc.ReadOptions(column_names=names, use_threads=True)
         rounded_types = {name: pa.float64() for name, kind in types.items() if pa.types.is_decimal(kind)}
 
         def parsed(block: Sequence[bytes | memoryview], kinds: Mapping[str, pa.DataType]) -> pa.Table:
-            return pc.read_csv(pa.BufferReader(owned(*block)), read, parse, self._conversion(kinds))
+            return pc.read_csv(pa.BufferReader(owned(*block)), read_options, parse, self._conversion(kinds))
 
         for block in self._blocks():
             try:
@@ -270,9 +270,9 @@ class TextTable:
 
         def parse(kind: pa.DataType) -> pa.ChunkedArray:
             text = pa.BufferReader(owned(f'"{cell}"\n'.encode()))
-            read = pc.ReadOptions(column_names=["x"], use_threads=False)
+            read_options = pc.ReadOptions(column_names=["x"], use_threads=False)
             options = pc.ConvertOptions(column_types={"x": kind}, null_values=[], decimal_point=self.stream.decimal)
-            return pc.read_csv(text, read, convert_options=options)["x"]
+            return pc.read_csv(text, read_options, convert_options=options)["x"]
 
         try:
             parse(kind)

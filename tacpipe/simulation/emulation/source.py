@@ -146,7 +146,7 @@ class SampleSource(Sampled):
     def _uskin(self, view: SensorView, block: int, rng: np.random.Generator) -> Counts:
         """Return the counts of a uSkin (time, channel) like `pick_and_move`, with a drift that continues between blocks."""
         skin = view.world.skins[view.finger]
-        noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
+        noise = taxels.draw_errors(view.t_ns / 1e9, 1.0, 0.0, rng)
         counts = skin.base_count + taxels.signal(skin, view.world.touch(view.finger, view.t_ns)) + noise
         digits = taxels.digitise(counts + self._drift_of_block(block))
         return faults.hold(digits, pick_and_move.PickRig().hold_probability, rng)[0]
@@ -157,7 +157,7 @@ class SampleSource(Sampled):
             number = min(block, len(self._drift) - 1)
             rng = np.random.default_rng([*self._seed, 2, number])
             at_s = self.timing.sample_ns(number * self.rows + np.arange(self.rows + 1)) / 1e9
-            walk = self._drift[number] + taxels.errors(at_s, 0.0, 1.0, rng)
+            walk = self._drift[number] + taxels.draw_errors(at_s, 0.0, 1.0, rng)
             if number == len(self._drift) - 1:
                 self._drift.append(walk[-1])
             if number == block:

@@ -240,7 +240,7 @@ class Forecaster:
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
-        """Return the result of `tacpipe.tasks.task.quantiles_of` for the model."""
+        """Return the quantiles, and the indices of ``percents`` among them; see `tacpipe.tasks.task.quantiles_of`."""
         return quantiles_of(self.quantiles, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:

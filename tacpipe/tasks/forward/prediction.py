@@ -99,9 +99,9 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     starts = track.starts(forecaster.context, forecaster.horizon)
     window_rows = starts[:, None] + np.arange(forecaster.context + forecaster.horizon)
     past, ahead = np.split(window_rows, [forecaster.context], axis=1)
-    read = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
-    moved = track.arm[past][..., read].astype(np.float64)
-    plan = track.planned_arm(ahead)[..., read].astype(np.float64)
+    arm_columns = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
+    moved = track.arm[past][..., arm_columns].astype(np.float64)
+    plan = track.planned_arm(ahead)[..., arm_columns].astype(np.float64)
     window = np.concatenate([track.tactile[past], moved, track.finger[past][..., None]], axis=-1)
     return WindowArrays(window, plan, track.t_ns[past[:, -1]])
 

@@ -69,8 +69,8 @@ class ResidualQuantiles:
         centre = rows.mean(axis=0, dtype=np.float64)
         spread = rows.std(axis=0, dtype=np.float64)
         spread = np.where(spread > 0, spread, 1.0)
-        read = _standardise(rows, centre, spread)
-        network = _train_network(read, (errors / unit).reshape(len(rows), -1), levels, seed, passes)
+        inputs = _standardise(rows, centre, spread)
+        network = _train_network(inputs, (errors / unit).reshape(len(rows), -1), levels, seed, passes)
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
         weights = tuple(layer.weight.detach().numpy().T.copy() for layer in layers)
         biases = tuple(layer.bias.detach().numpy().copy() for layer in layers)

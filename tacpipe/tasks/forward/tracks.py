@@ -155,13 +155,13 @@ class Track:
         def part_of(values: AnyFloats | Levels) -> AnyFloats | Levels:
             return values.rows_between(first, last) if isinstance(values, Levels) else values[first:last]
 
-        cut = {
+        selected = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
         for name in ("slips", "plan_velocity"):
             if getattr(self, name) is not None:
-                cut[name] = getattr(self, name)[first:last]
-        return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **cut)
+                selected[name] = getattr(self, name)[first:last]
+        return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **selected)
 
     def put_aside(self, mapped: MappedArrays) -> Track:
         """Return the same track with its rows stored in ``mapped``."""

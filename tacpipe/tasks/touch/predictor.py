@@ -258,7 +258,7 @@ class Predictor:
         )
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ReadingQuantiles, list[int]]:
-        """Return `tacpipe.tasks.task.quantiles_of` for this model."""
+        """Return the quantiles, and the indices of ``percents`` among them; see `tacpipe.tasks.task.quantiles_of`."""
         return task.quantiles_of(self.quantiles, percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[PredictedReading]:

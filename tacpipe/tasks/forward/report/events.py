@@ -21,9 +21,9 @@ def rows_by_predictor(
     key: Literal["anticipation", "slips"],
     scores_of: Callable[[Method, str], Figures | None],
 ) -> list[tuple[str, Figures]]:
-    """Return names and what ``of`` a method and a predictor gives, for all that state it.
+    """Return the title of each model and baseline, and the result of ``scores_of`` for it, if there is one.
 
-    A baseline is the same for all methods, so it is taken from the method whose most runs state it under ``key``.
+    A baseline is the same for all methods, so it is taken from the method with the most runs that have it under ``key``.
     """
     rows = [(method.name, scores_of(method, MODEL)) for method in methods]
     names = {name for method in methods for run in method.runs for name in getattr(run.details.metrics, key)} - {MODEL}

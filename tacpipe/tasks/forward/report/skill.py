@@ -190,10 +190,10 @@ def _fresh_rows(runs: Sequence[ComparedRun]) -> pd.DataFrame:
 
     The column ``unit`` has the clusters of intervals: recordings, or objects if these are unseen.
     """
-    read = read_coverage([run.dataset for run in runs])
-    assert read is not None, "each run has a coverage file"
-    read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
-    fresh: pd.DataFrame = read[~read.seen]
+    coverage = read_coverage([run.dataset for run in runs])
+    assert coverage is not None, "each run has a coverage file"
+    coverage["unit"] = coverage["recording"].where(coverage["known"] | coverage["object"].isna(), coverage["object"])
+    fresh: pd.DataFrame = coverage[~coverage.seen]
     return fresh
 
 
