@@ -79,7 +79,7 @@ def value_columns(target: str) -> list[str]:
 
 
 def normalise(target: str, counts: Floats) -> Floats:
-    """Scale counts of a target to fractions of its range in `RANGES`, 0 to 1."""
+    """Scale counts of a target to fractions of its range in `RANGES`, 0 to 1, with the same shape."""
     low, high = RANGES[target]
     return (np.asarray(counts, np.float64) - low) / (high - low)
 

@@ -212,7 +212,10 @@ def _quadric_features(name: str, points: Floats, place_m: float) -> dict[str, fl
 
 
 def _outward_normal(normal: Floats, place_m: float) -> Floats:
-    """Return a normal at a contact, with the sign for which it points away from the object: up, and to the finger's side."""
+    """Return the normal (xyz,) at a contact with the sign for which it points away from the object.
+
+    That is up, and to the side of the finger, which touches at ``place_m`` on the closing axis.
+    """
     return normal if np.sign(place_m) * normal[1] - normal[0] > 0 else -normal
 
 
@@ -254,7 +257,7 @@ class Extent:
 
 
 def _corners(points_m: AnyFloats) -> Indices:
-    """Return the indices of the corners of the convex hull, or all points if they are in one plane."""
+    """Return the indices of the corners of the convex hull of points (point, xyz); all if they are in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:

@@ -125,6 +125,9 @@ def _to_unit_range(pixels: Tensor) -> Tensor:
 
 
 def select_images(images: Sequence[Bytes], held_out: float) -> tuple[Bytes, Bytes]:
-    """Split the images of recordings into those for training and those of the last ``held_out`` recordings, at least one."""
+    """Return the images for training, and those of the last recordings, which are held out.
+
+    ``held_out`` is the fraction of held-out recordings; at least one is held out.
+    """
     count = max(1, round(held_out * len(images)))
     return np.concatenate(images[:-count]), np.concatenate(images[-count:])

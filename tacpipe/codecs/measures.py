@@ -71,13 +71,13 @@ class RowCodec(Protocol):
 
     @property
     def scale_count(self) -> AnyFloats:
-        """The spread of each channel on training rows, in counts."""
+        """The spread of each channel (channel,) on training rows, in counts."""
 
     def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent) of finite rows (row, frames * channel)."""
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Decode latents to counts."""
+        """Decode latents (row, latent) to counts (row, channel)."""
 
 
 def reconstructions(codec: RowCodec, parts: Mapping[str, Iterable[AnyFloats]]) -> dict[str, Reconstruction]:
@@ -205,7 +205,7 @@ class Moments:
 
     @property
     def varies(self) -> Bools:
-        """Whether each channel has more than one value; exact, in contrast to a standard deviation."""
+        """Whether each channel (channel,) has more than one value; exact, in contrast to a standard deviation."""
         return self._high > self._low
 
     @property
@@ -234,6 +234,6 @@ class Moments:
 
 
 def _triangle(rows: AnyFloats) -> AnyFloats:
-    """Return the R of a QR decomposition."""
+    """Return the triangular factor R (column, column) of a QR decomposition of rows (row, column)."""
     triangle: AnyFloats = np.asarray(np.linalg.qr(rows, mode="r"))
     return triangle

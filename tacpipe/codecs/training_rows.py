@@ -63,7 +63,7 @@ class TrainingRows:
 
     @property
     def parts(self) -> tuple[AnyFloats, AnyFloats]:
-        """The rows of the recordings that are not held out, and of those that are."""
+        """The rows (row, frames * channel) of the recordings that are not held out, and of those that are."""
         return self.select(self.inputs.keys() - self.held_out), self.select(self.held_out)
 
     def select(self, names: Collection[str]) -> AnyFloats:
@@ -72,7 +72,7 @@ class TrainingRows:
         return np.concatenate([np.zeros((0, width)), *self.pieces(names)])
 
     def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
-        """Yield the rows of each of some recordings, ordered by name."""
+        """Yield the rows (row, frames * channel) of each recording in ``names``, ordered by name."""
         return (self.inputs[name] for name in sorted(names))
 
 
@@ -92,7 +92,7 @@ class StoredRows:
         return self.recordings.keys()
 
     def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
-        """Yield the rows of some recordings in chunks, ordered by name and time.
+        """Yield chunks of rows (row, frames * channel) of the recordings in ``names``, ordered by name and time.
 
         Raises `TacpipeError` with the name of a recording whose channels differ.
         """
@@ -116,7 +116,7 @@ class StoredRows:
         return np.zeros((0, self.frames * len(self.channels)))
 
     def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
-        """Yield the rows of a recording that are suitable for fitting a codec."""
+        """Yield chunks of the rows (row, frames * channel) of a recording that are suitable for fitting a codec."""
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
         begins, gaps = codec.run_starts(tactile.times(stored)), tactile.gap_mask(stored)
         in_contact = np.ones(len(begins), dtype=bool)

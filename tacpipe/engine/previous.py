@@ -60,11 +60,11 @@ class Previous:
         now = {page.digest for page in entries.pages.pages}
         firsts = [page.first for page in results.pages] + [""]
         places = {first: number for number, first in enumerate(firsts)}
-        read = before.pages.pages
-        followers = [*(page.first for page in read[1:]), ""]
+        earlier_pages = before.pages.pages
+        followers = [*(page.first for page in earlier_pages[1:]), ""]
         reusable: dict[str, Pages] = {}
         replaced_pages = set(range(len(results)))
-        for page, follower in zip(read, followers, strict=True):
+        for page, follower in zip(earlier_pages, followers, strict=True):
             number = places.get(page.first)
             if page.digest not in now or number is None or number == len(results):
                 continue

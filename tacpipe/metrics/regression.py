@@ -88,7 +88,7 @@ def skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) ->
 
 
 def _error(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
-    """Return predicted minus true as float64."""
+    """Return predicted minus true values (grasp, value) as float64. Raises `TacpipeError` for other shapes."""
     if np.ndim(true) != 2 or np.shape(true) != np.shape(predicted):
         raise TacpipeError(
             f"True values of the shape {np.shape(true)} and predicted ones of {np.shape(predicted)} cannot be compared; "

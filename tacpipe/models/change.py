@@ -174,7 +174,7 @@ def spread(rows: Tensor) -> Tensor:
 
 
 def _scale(spread: Tensor) -> Tensor:
-    """Return ``spread``, or 1 where it is 0."""
+    """Return ``spread`` with 1 in place of 0."""
     return torch.where(spread > 0, spread, 1.0)
 
 

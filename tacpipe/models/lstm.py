@@ -86,7 +86,7 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
 
 
 def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
-    """Compute the same with torch's layer: cuDNN on a GPU, and the fastest on a CPU without gradients."""
+    """Return the result of `lstm`, computed by torch's layer: cuDNN on a GPU, and the fastest on a CPU without gradients."""
     from_input, from_state, bias = weights
     if lead is not None:
         later = lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)

@@ -82,7 +82,7 @@ def guess_options(data: Chunks) -> list[Options]:
 
 
 def _lines(data: Chunks) -> tuple[list[str], Times]:
-    """Return the complete lines, and the arrival of each in ns."""
+    """Return the complete lines, and the arrival of each (line,) in ns."""
     buffer = ByteBuffer()
     buffer.append(data)
     stop = data.data.rfind(b"\n")
@@ -142,7 +142,10 @@ def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) 
 
 
 def _split_cells(lines: Sequence[str]) -> tuple[str, str, str, str, list[list[str]], Int64s] | None:
-    """Return prefix, separator, suffix, decimal mark, and the cells and indices of the lines with the same layout."""
+    """Return prefix, separator, suffix, decimal mark, and the cells and indices of the lines with the most common layout.
+
+    Returns None if no separator fits most lines.
+    """
     prefix = _common_prefix(lines)
     bodies = [line.removeprefix(prefix) for line in lines]
     for separator in SEPARATORS:

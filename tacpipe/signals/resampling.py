@@ -93,7 +93,10 @@ def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -
 
 
 def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
-    """Return the sorted rows that `linear` and `slerp` read. With 1 kHz samples on a 50 Hz grid, these are 10 %."""
+    """Return the ascending indices of the rows that `linear` and `slerp` read.
+
+    With 1 kHz samples on a 50 Hz grid, these are 10 %.
+    """
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     bracketing = np.zeros(len(t_ns), dtype=bool)
     bracketing[lower] = bracketing[upper] = True

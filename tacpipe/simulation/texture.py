@@ -119,7 +119,7 @@ def spectrum(material: Material, aperture_m: float, parts: int = 400) -> tuple[F
 
 
 def _edges(parts: int) -> Floats:
-    """Return the limits of ``parts`` logarithmically spaced wave number bands of a background."""
+    """Return the limits (parts + 1,) of ``parts`` logarithmically spaced wave number bands of a background."""
     return np.geomspace(1 / BACKGROUND_M[1], 1 / BACKGROUND_M[0], parts + 1)
 
 

@@ -261,7 +261,7 @@ def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[Time
 
 
 def _repeated_rows(columns: Columns) -> Bools:
-    """Return a mask of rows that repeat the previous one in all channels except labels, which are often constant."""
+    """Return a mask (time,) of rows that repeat the previous row in all channels but labels, which are often constant."""
     import numpy as np
 
     from tacpipe.arrays import from_arrow
@@ -300,7 +300,7 @@ def grid(
     *,
     hold_values: bool,
 ) -> tuple[Int64s, Int64s]:
-    """Return the grid points within all streams, and their rows in the master or in the uniform grid.
+    """Return the grid points (grid,) in ns within all streams, and their rows in the master or in the uniform grid.
 
     A uniform grid starts at the master's first sample. With ``hold_values`` the grid ends with the last stream, because
     online the last sample of a stream is unknown, and equal times become one point. Raises `TacpipeError` if there are no

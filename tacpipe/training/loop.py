@@ -192,7 +192,7 @@ class WindowTraining:
                 )
 
     def batches(self, epoch: int) -> list[Tensor]:
-        """Return the indices of all training windows, shuffled."""
+        """Return the indices of all training windows, shuffled, in batches (window,)."""
         return list(_chunks(torch.randperm(self.training.count), self.batch))
 
     def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
@@ -367,6 +367,6 @@ def _improved_parts(
 
 
 def _chunks(indices: Tensor, batch: int) -> Iterator[Tensor]:
-    """Yield the indices in chunks of ``batch``; the last may be shorter."""
+    """Yield the indices (index,) in chunks of ``batch``; the last may be shorter."""
     for first in range(0, len(indices), batch):
         yield indices[first : first + batch]

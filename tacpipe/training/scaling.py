@@ -23,13 +23,13 @@ class MinMax:
 
     @property
     def half(self) -> Floats:
-        """Half the range of each dimension, or 1 if it is constant."""
+        """Half the range of each dimension (dimension,), or 1 if it is constant."""
         half = (self.high - self.low) / 2
         return np.where(half > 0, half, 1.0)
 
     @property
     def centre(self) -> Floats:
-        """The middle of each dimension's range."""
+        """The middle of each dimension's range (dimension,)."""
         return (self.high + self.low) / 2
 
     def scale(self, values: Floats) -> Floats:

@@ -401,7 +401,7 @@ def spacing(places: Floats) -> float:
 
 
 def _display_rows(t_ns: Times) -> Indices:
-    """Return rows that are at least one display frame apart; all rows if the stream is slower."""
+    """Return the indices of evenly spaced rows, at most one per display frame; all rows if the stream is slower."""
     if len(t_ns) < 2:
         return np.arange(len(t_ns))
     seconds = (t_ns[-1] - t_ns[0]) / 1e9

@@ -378,7 +378,7 @@ def _taxel_and_axis(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) 
 
 
 def _native_values(values: AnyArray, array: ArrayDescription) -> AnyArray:
-    """Return values converted to a type that columns support."""
+    """Return the values, with the same shape, in a type that columns support."""
     if is_frames(array) and values.dtype.kind == "O":
         return values
     if is_text(array) or values.dtype.kind in "SUOT":

@@ -187,7 +187,7 @@ def _from_iso_text(column: pa.Array, zone: str) -> Int64s:
 
 
 def _from_format(column: pa.Array, time: Time) -> Int64s:
-    """Return timestamps given as text in the format of ``time``."""
+    """Return the timestamps (row,) in ns UTC of a column of text in the format of ``time``."""
     t_ns, valid = parse_stamps(column.cast(pa.string()), time.format)
     _refuse_flagged(pa.array(~valid), column, f"a time in the format {time.format}")
     return _to_utc(t_ns if has_date(time.format) else t_ns + _day_ns(time), time.zone)
@@ -199,7 +199,7 @@ def _day_ns(time: Time) -> int:
 
 
 def _to_utc(t_ns: Int64s, zone: str) -> Int64s:
-    """Convert nanoseconds of local time in a zone to UTC."""
+    """Convert nanoseconds (row,) of local time in a zone to UTC."""
     if zone == "UTC":
         return t_ns
     stamps = pc.assume_timezone(pa.array(t_ns).cast(pa.timestamp("ns")), zone, ambiguous="earliest")
@@ -244,13 +244,13 @@ def overflows(rounded: pa.ChunkedArray) -> Bools:
 
 
 def _decimal_words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:
-    """Return the high and low 64-bit words of decimal128 values."""
+    """Return the high and the low 64-bit words (row,) of decimal128 values."""
     words = np.frombuffer(column.buffers()[1], dtype="<i8").reshape(-1, 2)[column.offset :][: len(column)]
     return words[:, 1], words[:, 0].view(np.uint64)
 
 
 def _from_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> Int64s:
-    """Convert seconds with 18 decimals, given as two words, to nanoseconds, rounded half to even."""
+    """Convert seconds with 18 decimals, as two words (row,), to nanoseconds, rounded half to even."""
     high_whole, high_remainder = divmod(1 << 64, _UNIT)  # the high word counts 2^64
     low_whole, low_left = np.divmod(low, np.uint64(_UNIT))
     carried, remainder = np.divmod(high * high_remainder + low_left.astype(np.int64), _UNIT)

@@ -127,7 +127,10 @@ def _normal(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _force(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return the hand's load cell values, the negative contact force; for fields without an axis, the finger's pressure."""
+    """Return the values (time, field) of the hand's load cell, the negative contact force.
+
+    Fields without an axis have the finger's pressure.
+    """
     load = -view.world.contact(view.t_ns, lambda scene: scene.contact.force_n)
     normal = view.world.contact(view.t_ns, lambda scene: scene.contact.normal_n[:, view.finger])
     return _vector(np.column_stack([load, normal]), fields, schema.AXES, 3)
@@ -139,7 +142,7 @@ def _torque(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _vibration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return a vibration with the amplitude of the slip speed in m/s. Fields of one quantity are successive readings."""
+    """Return a vibration (time, field) with the amplitude of the slip speed in m/s. Fields are successive readings."""
     speed = np.linalg.norm(view.world.contact(view.t_ns, lambda scene: scene.contact.velocity_m_s), axis=1)
     phase = np.arange(len(fields)) * 2.4 + (view.t_ns % 1_000_000_007)[:, None] * 1e-7
     ringing: Floats = speed[:, None] * np.sin(phase)
@@ -172,7 +175,7 @@ def _velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _acceleration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
-    """Return the values of an accelerometer on the hand, which measures upward gravity at rest."""
+    """Return the values (time, field) of an accelerometer on the hand, which measures upward gravity at rest."""
     at = view.world.contact(view.t_ns, lambda scene: scene.path.hand_acceleration_m_s2)
     return _vector(at + np.array([0.0, 0.0, GRAVITY_M_S2]), fields, schema.AXES, 2)
 

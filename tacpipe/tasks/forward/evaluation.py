@@ -256,8 +256,8 @@ def _predictions(
     loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
-    none = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
-    gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, none))
+    no_windows = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
+    gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, no_windows))
     for windows in iterate_predictions(forecaster, track, starts):
         trial.windows += len(windows.now)
         doing = situations.window_situations(track, windows.now, forecaster.horizon)

@@ -64,7 +64,7 @@ class Rows:
         return ForecastWindows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
-        """Return the mean loss of the windows with these indices."""
+        """Return the mean loss of the windows with these indices (window,)."""
         picked, ahead = self.pick(self.starts[indices.to(self.starts.device)])
         lost: Tensor = model.loss(with_actions(picked, self.actions), ahead)  # type: ignore[operator]
         return lost
@@ -87,7 +87,7 @@ class Rows:
         return levels
 
     def evenly_spread(self, limit: int) -> Tensor:
-        """Return at most ``limit`` evenly spaced starts."""
+        """Return at most ``limit`` evenly spaced starts of windows (window,)."""
         return self.starts[:: max(1, -(-len(self.starts) // limit))]
 
 

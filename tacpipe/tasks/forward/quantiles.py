@@ -144,7 +144,10 @@ def _train_network(read: Float32s, errors: Float32s, levels: AnyFloats, seed: in
 
 
 def _ordered_tensor(raw: torch.Tensor, middle: int) -> torch.Tensor:
-    """Return ascending quantiles: the raw median, and outwards from it cumulative sums of softplus values."""
+    """Return ascending quantiles (…, level) from network outputs (…, level), of which ``middle`` is the median.
+
+    The others are cumulative sums of softplus values, outwards from the median.
+    """
     median = raw[..., middle : middle + 1]
     up = median + functional.softplus(raw[..., middle + 1 :]).cumsum(-1)
     down = median - functional.softplus(raw[..., :middle].flip(-1)).cumsum(-1).flip(-1)
@@ -152,7 +155,7 @@ def _ordered_tensor(raw: torch.Tensor, middle: int) -> torch.Tensor:
 
 
 def _sort_quantiles(raw: AnyFloats, middle: int) -> AnyFloats:
-    """Do the same as `_ordered_tensor` on an array."""
+    """Return the result of `_ordered_tensor` for an array."""
     median = raw[..., middle : middle + 1]
     up = median + np.logaddexp(raw[..., middle + 1 :], 0).cumsum(-1)
     down = median - np.logaddexp(raw[..., :middle][..., ::-1], 0).cumsum(-1)[..., ::-1]
@@ -356,5 +359,5 @@ def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:
 
 
 def fewer(starts: Int64s, limit: int) -> Int64s:
-    """Return at most ``limit`` evenly spaced windows of a recording."""
+    """Return at most ``limit`` evenly spaced entries of ``starts`` (window,)."""
     return starts[:: max(1, -(-len(starts) // limit))]

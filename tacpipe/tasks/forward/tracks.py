@@ -55,7 +55,7 @@ class Levels:
         return self.stored.shape
 
     def __getitem__(self, at: Any) -> AnyFloats:
-        """Return the levels at an index of rows, or of rows and channels."""
+        """Return the levels at an index of rows, or at a pair of indices of rows and of channels."""
         rest_counts = self.rest_counts[at[1]] if isinstance(at, tuple) else self.rest_counts
         levels: AnyFloats = np.subtract(self.stored[at], rest_counts, dtype=np.float64)
         return levels.astype(self.dtype, copy=False)

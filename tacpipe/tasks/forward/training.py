@@ -175,7 +175,10 @@ def _built(
 
 @torch.no_grad()
 def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, watched: Rows) -> dict[str, Tensor]:
-    """Return each step's weight of the forecast, fitted on validation windows; empty for a forecast of levels."""
+    """Return a tensor with each step's weight of the forecast, fitted on validation windows.
+
+    The result is empty for a model that forecasts levels.
+    """
     model = networks.build(params, codec).eval()
     if not model.change_only:
         return {}
@@ -306,7 +309,7 @@ def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
 
 
 def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track, Int64s]]:
-    """Yield each recording with its usable rows, in batches."""
+    """Yield each recording with the indices (row,) of its usable rows, in batches."""
     for track in part:
         rows = np.flatnonzero(track.usable)
         for first in range(0, len(rows), BLOCK_ROWS):

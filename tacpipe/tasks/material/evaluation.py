@@ -105,7 +105,7 @@ class Evaluated:
     counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,), whether it is evaluated
 
     def is_right(self, predictor: str, mask: Bools) -> Bools:
-        """Return which of the chosen slides a predictor classified correctly."""
+        """Return whether a predictor classified each slide in ``mask`` correctly (chosen slide,)."""
         is_right: Bools = (self.predicted[predictor] == self.slides.materials)[mask]
         return is_right
 
@@ -220,7 +220,7 @@ def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str
 
 
 def _exchanged_predictions(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
-    """Return the materials predicted by another sensor's classifier, in terms of this sensor's materials.
+    """Return the materials (slide,) predicted by another sensor's classifier, in terms of this sensor's materials.
 
     Sensors aligned with permuted classes share a space in which each material has the position of its partner.
     Predictions are then mapped back by the inverse permutation.
@@ -249,7 +249,7 @@ def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> F
 def _zero_shot_predictions(
     classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]
 ) -> tuple[Int64s, Int64s]:
-    """Return another sensor's predictions: among all materials, and among held-out ones only."""
+    """Return another sensor's predictions (slide,): among all materials, and among held-out ones only."""
     scores = _partner_scores(classifier, sensor, latents)
     is_held_out = np.isin(classifier.classes, held_out)
     return classifier.best_classes(scores), classifier.best_classes(np.where(is_held_out, scores, -np.inf))

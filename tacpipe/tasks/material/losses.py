@@ -63,7 +63,7 @@ class BatchPairs:
             )
 
     def epoch(self) -> list[dict[str, Tensor]]:
-        """Return the batches of an epoch: for each sensor the slide in each row of the batch, or NONE.
+        """Return the batches of an epoch: for each sensor the slide in each row (row,) of the batch, or NONE.
 
         Random choices use torch's generator; choices that are drawn once use ``seed``. Rows and batches without slides
         are omitted.
@@ -136,7 +136,7 @@ def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
 
 
 def _stack_padded(members: Sequence[Tensor]) -> Tensor:
-    """Stack index tensors as rows of one tensor, padding the shorter ones with NONE."""
+    """Stack index tensors as rows of one tensor (member, index), padding the shorter ones with NONE."""
     longest = max(map(len, members))
     block = torch.full((len(members), longest), NONE)
     for row, indices in zip(block, members, strict=True):
@@ -222,7 +222,7 @@ class JointWork:
         return self.weights.alignment > 0 and len(self.training) > 1
 
     def batches(self, epoch: int) -> list[dict[str, Tensor]]:
-        """Return the batches of an epoch: for each sensor the slide in each row."""
+        """Return the batches of an epoch: for each sensor the slide in each row (row,), or NONE."""
         self._sums = _EpochSums()
         return self.pairs.epoch()
 
@@ -265,7 +265,10 @@ class JointWork:
         return output, total
 
     def _pair_loss(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
-        """Return the mean squared difference of latents in rows shared by two sensors, averaged over pairs of sensors."""
+        """Return the mean squared difference of latents in rows that two sensors share, or None if there are none.
+
+        It is averaged over pairs of sensors.
+        """
         pair_losses = []
         for sensor, partner in combinations(output, 2):
             latents, valid = zip(

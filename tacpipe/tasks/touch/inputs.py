@@ -96,7 +96,7 @@ class CloudSources:
 
     @cached_property
     def wrists(self) -> list[Floats | None]:
-        """Rotation of each wrist, or its estimate."""
+        """The rotation (component, axis) of each grasp's wrist, or its estimate; None if the grasp has no wrist."""
         if self.inputs.wrist == "estimated":
             return [frame.estimate_wrist(grasp) for grasp in self.grasps]
         return [grasp.wrist for grasp in self.grasps]
@@ -239,7 +239,10 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
 
 
 def _contact_indices(points: Floats, place_m: float, radius_m: float) -> Indices:
-    """Return the indices of the points within a radius of a contact, or the nearest point if there are none."""
+    """Return the indices of the points (point, xyz) within a radius of a contact, or of the nearest point.
+
+    ``place_m`` is the contact's position along y, the closing axis.
+    """
     away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
     inside = np.flatnonzero(away <= radius_m)
     return inside if len(inside) else np.array([int(away.argmin())])

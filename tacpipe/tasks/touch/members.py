@@ -76,7 +76,7 @@ class TouchWork:
             raise TacpipeError(f"There are {len(self.training)} grasps to learn from; there must be 2 or more.")
 
     def batches(self, epoch: int) -> list[Tensor]:
-        """Return shuffled batches of indices of all training grasps; a single leftover grasp joins the previous batch."""
+        """Return the indices of all training grasps in shuffled batches; a single leftover grasp joins the last batch."""
         shuffled = torch.randperm(len(self.training))
         sizes = [self.batch] * (len(shuffled) // self.batch)
         remainder = len(shuffled) % self.batch

@@ -311,7 +311,7 @@ class Published:
         return np.concatenate([self.values, self.quantiles], axis=1)
 
     def matching_rows(self, forecasts: Sequence[GridForecast]) -> Float32s:
-        """Return the same for other forecasts, which must all have values and the published quantiles."""
+        """Return the rows of `values_and_quantiles` for ``forecasts``, which must all have values and these quantiles."""
         places = [step - 1 for step in self.steps]
         rows: list[Float32s] = []
         for forecast in forecasts:

@@ -157,7 +157,7 @@ class ForecastMessage(messages.Message):
 
     @property
     def alarm_scores(self) -> AnyFloats:
-        """The score of each alarm."""
+        """The score of each alarm (alarm,), in the order of `NAMES`."""
         return np.array([self.alarms[name].score for name in NAMES], np.float32)
 
 

@@ -297,7 +297,10 @@ def _latent_chart(method: Method) -> Chart | None:
 def _latent_rows(
     points: Sequence[AnyFloats], parts: Sequence[SlidePredictions], partners: Mapping[int, int]
 ) -> list[tuple[str, AnyFloats, AnyFloats]]:
-    """Return each material's name, the mean of the first sensor's slides, and that of the partner's by the other sensor."""
+    """Return each material's name, and the means (coordinate,) of its points for both sensors.
+
+    The mean for the second sensor is that of the material's partner, if it has a partner.
+    """
     means = [
         {int(material): at[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
         for at, part in zip(points, parts, strict=True)
