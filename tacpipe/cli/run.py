@@ -86,7 +86,7 @@ def _run(chain: Chain, *, quiet: bool) -> int:
             continue
         if not quiet:
             terminal.note(f"{stage.name}:")
-        became[stage.name], code = _stage(stage)
+        became[stage.name], code = _run_stage(stage)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         if code:
@@ -187,7 +187,7 @@ def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
     return scheduler.first
 
 
-def _stage(stage: ChainStage) -> tuple[Became, int]:
+def _run_stage(stage: ChainStage) -> tuple[Became, int]:
     """Run a stage's commands until one fails. Returns the stage's outcome and the exit code."""
     became = Became.UNCHANGED
     for command in stage.commands:
@@ -195,7 +195,7 @@ def _stage(stage: ChainStage) -> tuple[Became, int]:
         if words is not None and _report_if_current(words[1:]):
             continue
         became = Became.RAN
-        code = _process(command if words is None else [*PROGRAM, *words[1:]])
+        code = _run_process(command if words is None else [*PROGRAM, *words[1:]])
         if code:
             return Became.FAILED, code
     return became, DONE
@@ -240,7 +240,7 @@ def _report_if_current(arguments: Sequence[str]) -> bool:
     return code in (None, DONE)
 
 
-def _process(command: str | list[str]) -> int:
+def _run_process(command: str | list[str]) -> int:
     """Run a command and return its exit code; a string is run by the shell. The command itself reports interrupts."""
     sys.stdout.flush()
     shell = isinstance(command, str)

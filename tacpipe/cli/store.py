@@ -143,7 +143,7 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
     _print(asdict(soundness), as_json=as_json, text=soundness.to_text(changed=isinstance(store, Store)))
     if soundness.damaged or soundness.missing or soundness.lost:
         raise typer.Exit(DAMAGED)
-    _end_unread(soundness)
+    _exit_if_unread(soundness)
 
 
 def repair(as_json: AsJson = False) -> None:
@@ -161,10 +161,10 @@ def repair(as_json: AsJson = False) -> None:
     _print(asdict(soundness), as_json=as_json, text=soundness.to_text())
     if soundness.lost:
         raise typer.Exit(DAMAGED)
-    _end_unread(soundness)
+    _exit_if_unread(soundness)
 
 
-def _end_unread(soundness: Soundness) -> None:
+def _exit_if_unread(soundness: Soundness) -> None:
     """Exit with 1 if the system failed to read objects, whose state is therefore unknown."""
     if soundness.unread:
         terminal.report_progress(

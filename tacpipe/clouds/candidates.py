@@ -244,9 +244,9 @@ def draw(cloud: Cloud, grasp_candidates: Sequence[Candidate], path: Path) -> Non
     with matplotlib.rc_context({"svg.hashsalt": "candidates"}):
         figure = Figure(figsize=(11, 6), layout="constrained", dpi=150)
         above, side = figure.subplots(1, 2)
-        _panel(above, cloud, grasp_candidates, (0, 1), ranks=True)
+        _draw_panel(above, cloud, grasp_candidates, (0, 1), ranks=True)
         above.set_title("as the camera sees it", loc="left")
-        _panel(side, cloud, grasp_candidates, (_closing_axis(grasp_candidates), 2), ranks=False)
+        _draw_panel(side, cloud, grasp_candidates, (_closing_axis(grasp_candidates), 2), ranks=False)
         side.set_title("from the side", loc="left")
         figure.legend(*_legend(), loc="outside lower center", ncols=2, frameon=False)
         content, kind = io.BytesIO(), path.suffix.lower()[1:]
@@ -267,7 +267,7 @@ def _closing_axis(grasp_candidates: Sequence[Candidate]) -> int:
     return int(np.argmax(np.abs(grasp_candidates[0].grasp.closing[:2]))) if grasp_candidates else 0
 
 
-def _panel(
+def _draw_panel(
     axes: Axes, cloud: Cloud, grasp_candidates: Sequence[Candidate], plotted_axes: tuple[int, int], *, ranks: bool
 ) -> None:
     """Draw a cloud and its grasps on two of the axes x, y, z, in millimetres; the second axis points down as in an image."""

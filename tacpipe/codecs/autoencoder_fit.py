@@ -69,7 +69,7 @@ def candidate_networks(
             f"hidden is {hidden!r} and search is {search}, which chooses its own widths. Give only one of them."
         )
     if not search:
-        return [NetworkShape(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
+        return [NetworkShape(_parse_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
     candidates = [
         NetworkShape(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
         for fast, decay in STEPS
@@ -211,7 +211,7 @@ def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[AnyFloats, Any
     return tuple((w, np.zeros(len(w), dtype=np.float32) if b is None else b) for w, b in pairs)
 
 
-def _widths(text: str) -> tuple[int, ...]:
+def _parse_widths(text: str) -> tuple[int, ...]:
     """Parse widths such as ``64,32``."""
     pieces = [piece.strip() for piece in text.split(",")]
     if not all(piece.isascii() and piece.isdecimal() and int(piece) > 0 for piece in pieces):

@@ -73,7 +73,7 @@ def trace(path: Path) -> LineageNode:
         dataset = manifest_of.find(path)
     places = {entry["manifest"]: entry["path"] for entry in store.roots.all()}
     tree = _node(store, dataset.manifest, dataset.digest, places)
-    changed = _changes(store, root, dataset.manifest)
+    changed = _describe_changes(store, root, dataset.manifest)
     written_s = 0 if root is None else int(root.get("written_s", 0))
     provenance = _provenance(store, dataset.digest, written_s, "" if root is None else root.get("key", ""))
     return {**tree, "provenance": provenance, "changes": changed}
@@ -124,7 +124,7 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Proven
     return None
 
 
-def _changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None:
+def _describe_changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None:
     """Describe the differences from the previous run; None if there was none."""
     previous = None if root is None else root.get("previous")
     if previous is None:

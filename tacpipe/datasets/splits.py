@@ -265,7 +265,9 @@ def _authors_folds(
     }
     published = any(recording.get("authors_role") == "test" for recording in attributes.values())
     part = {name: blocks.index(_block(name, attributes)) for name in names if _has_block(attributes[name])}
-    part |= _parts([name for name in names if name not in part and name not in fixed], attributes, scheme, len(blocks))
+    part |= _assign_parts(
+        [name for name in names if name not in part and name not in fixed], attributes, scheme, len(blocks)
+    )
     folds = []
     for fold in range(len(blocks)):
         turn = [name for name in names if name not in fixed and part[name] == fold]
@@ -294,7 +296,7 @@ def _block(name: str, attributes: Mapping[str, Attributes]) -> int:
 def _kfold(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
-    part = _parts(names, attributes, scheme, scheme.folds)
+    part = _assign_parts(names, attributes, scheme, scheme.folds)
     unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
     folds = []
     for fold in range(scheme.folds):
@@ -304,7 +306,9 @@ def _kfold(
     return folds
 
 
-def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int) -> dict[str, int]:
+def _assign_parts(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int
+) -> dict[str, int]:
     """Assign shuffled recordings to parts in turn, stratum by stratum, so that part sizes differ by at most one."""
     rng = np.random.default_rng(scheme.seed)
     strata = _strata(names, attributes, scheme).values()

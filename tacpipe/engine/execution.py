@@ -400,11 +400,11 @@ def _files(name: str, returned: Any) -> Result:
 
 
 def _entry(recording: RecordingOutput, sink: Store | ScratchStore, *, durable: bool) -> RecordingEntry:
-    shards = {stream: _shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
+    shards = {stream: _store_shard(table, sink, durable=durable) for stream, table in sorted(recording.streams.items())}
     return {"attributes": dict(sorted(recording.attributes.items())), "shards": shards}
 
 
-def _shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> Shard:
+def _store_shard(table: Any, sink: Store | ScratchStore, *, durable: bool) -> Shard:
     """Store a table, or batches as they arrive, as a shard."""
     from tacpipe.io import parquet
 

@@ -156,20 +156,20 @@ def _recording(params: Params, recording: Recording, losses: list[Loss], columns
 
     sink = Scratch()
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
-        losses += _attributes(file, recording.attributes)
+        losses += _write_attributes(file, recording.attributes)
         for stream in recording.streams:
             group = file.create_group(stream_label(stream), track_order=True)
             table = recording.columns(stream)
             for field in table.schema:
-                losses += _column(group, field, table.column(field.name), stream)
+                losses += _write_column(group, field, table.column(field.name), stream)
             columns += [(stream, name) for name in group]
             if params.images:
-                _images(group, table)
+                _write_images(group, table)
             sink.check()
     return sink.check()
 
 
-def _images(group: h5py.Group, columns: Columns) -> None:
+def _write_images(group: h5py.Group, columns: Columns) -> None:
     """Write the decoded frames of a stream of frames, one chunk per frame; rows without a frame are black."""
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import PACKET, read_format
@@ -186,7 +186,7 @@ def _images(group: h5py.Group, columns: Columns) -> None:
         dataset[row] = image
 
 
-def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:
+def _write_attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:
     """Set the attributes of a recording; yield those that HDF5 cannot represent as losses."""
     for name, value in values.items():
         if value is not None:
@@ -195,7 +195,7 @@ def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[
         yield Loss("attributes without a value (null): HDF5 has none, so they are left out")
 
 
-def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[Loss]:
+def _write_column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[Loss]:
     """Write a column; yield its losses."""
     import h5py
     import numpy as np
@@ -240,7 +240,7 @@ def _storage(values: AnyArray) -> Storage:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 
 
-def _array_dataset(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.Dataset:
+def _write_array(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.Dataset:
     """Write an array of a demonstration chunk by chunk; the file equals that of an array written at once."""
     import h5py
 
@@ -300,9 +300,9 @@ def _demos(
             demo = data.create_group(f"demo_{number}", track_order=True)
             table = frames.synchronized_columns(recording).select(columns)
             for array in frames.arrays_of_frames(table, params.actions):
-                dataset = _array_dataset(demo, array, table)
+                dataset = _write_array(demo, array, table)
                 dataset.attrs["columns"], dataset.attrs["units"] = array.columns, array.units
-            losses += [(recording.name, loss) for loss in _attributes(demo, recording.attributes)]
+            losses += [(recording.name, loss) for loss in _write_attributes(demo, recording.attributes)]
             demo.attrs["num_samples"] = table.num_rows
             demo.attrs["recording"] = recording.name
             sink.check()

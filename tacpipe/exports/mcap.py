@@ -99,7 +99,7 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
     writer.start(profile="ros2", library="tacpipe")
     record = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
     writer.add_metadata(RECORD, record)
-    messages = [message for stream in streams for message in _messages(writer, recording, stream)]
+    messages = [message for stream in streams for message in _register_topics(writer, recording, stream)]
     for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda message: message[0])):
         writer.add_message(channel, log_ns, content, log_ns, number)
     writer.finish()  # type: ignore[no-untyped-call]
@@ -177,7 +177,7 @@ def _start(recording: Recording, stream: str) -> int | None:
     return int(columns.column(TIME)[0].as_py())
 
 
-def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Iterator[tuple[int, int, bytes]]]:
+def _register_topics(writer: Writer, recording: Recording, stream: _Stream) -> list[Iterator[tuple[int, int, bytes]]]:
     """Register the topics of a stream; return log time, channel and content of each topic's messages, ordered by time.
 
     Topics of a stream have the same timestamps, so they consume the same rows at about the same time.

@@ -91,7 +91,7 @@ class Headline:
         """Return the headline as JSON, with its best baseline and verdict; undefined values are null."""
         fields = asdict(self)
         best = self.best
-        return {**_json(fields), "best_baseline": best.name if best else None, "verdict": self.verdict}
+        return {**_to_json(fields), "best_baseline": best.name if best else None, "verdict": self.verdict}
 
     @classmethod
     def from_json(cls, value: Json) -> Headline:
@@ -245,12 +245,12 @@ def _capitalize(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def _json(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """Replace undefined numbers by null and round floats to 9 digits; more would differ between machines."""
     if isinstance(value, dict):
-        return {name: _json(entry) for name, entry in value.items()}
+        return {name: _to_json(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_json(entry) for entry in value]
+        return [_to_json(entry) for entry in value]
     if isinstance(value, float):
         return float(f"{value:.9g}") if math.isfinite(value) else None
     return value

@@ -100,7 +100,7 @@ class KukaRsi(Sensor):
             table = np.array(numbers, dtype=np.float64).reshape(len(frames), 1 + sum(map(_width, self.outputs)))
         blocks, column = [], 1
         for name in self.outputs:
-            blocks.append(_columns(name, table[:, column : column + _width(name)]))
+            blocks.append(_to_columns(name, table[:, column : column + _width(name)]))
             column += _width(name)
         ipoc_ms = table[:, 0].astype(np.int64)
         return Samples(tuple(blocks), seq=ipoc_ms, t_device_ns=ipoc_ms * 1_000_000)
@@ -205,7 +205,7 @@ def _fields(name: str) -> list[pa.Field]:
     return [schema.float_field(name.replace(".", "_").lower(), "1", "state")]
 
 
-def _columns(name: str, numbers: Floats) -> Floats:
+def _to_columns(name: str, numbers: Floats) -> Floats:
     """Convert an output's numbers (sample, number) to m, rad and quaternions."""
     if name in POSES:
         return np.hstack([numbers[:, :3] / 1000, kinematics.angles_to_quaternions(np.radians(numbers[:, 3:]))])

@@ -159,11 +159,11 @@ class CachedStore(Store):
         if self._exists(name, size):
             return True
         if name not in self._bucket_sizes:
-            self._look({*self._requested, name})
+            self._query_bucket({*self._requested, name})
         stored_bytes = self._bucket_sizes[name]
         return stored_bytes is not None and size in (None, stored_bytes)
 
-    def _look(self, names: Iterable[str]) -> None:
+    def _query_bucket(self, names: Iterable[str]) -> None:
         """Query the bucket once for these objects."""
         unknown = [name for name in names if name not in self._bucket_sizes and not present(self.object_path(name))]
         self._requested.clear()
@@ -180,7 +180,7 @@ class CachedStore(Store):
 
         def bring(name: str) -> None:
             with contextlib.suppress(MissingError):
-                self._bring(name)
+                self._fetch_object(name)
 
         self.prepare()
         self.bucket  # noqa: B018  (before there are threads)
@@ -188,7 +188,7 @@ class CachedStore(Store):
             for _ in threads.map_in_threads(bring, absent, MAX_CONCURRENT if len(absent) > 1 else 1):
                 advance()
 
-    def _bring(self, name: str, size: int | None = None) -> None:
+    def _fetch_object(self, name: str, size: int | None = None) -> None:
         """Fetch and verify an object. Raises `MissingError` if it is missing or damaged in the bucket.
 
         An object that is damaged twice in a row is quarantined in the bucket, so that it is missing for everybody and
@@ -214,13 +214,13 @@ class CachedStore(Store):
         try:
             return super().read(name, size)
         except MissingError:
-            self._bring(name, size)
+            self._fetch_object(name, size)
             return super().read(name, size)
 
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Implement `Store.blocks`, fetching an object that is missing here."""
         if not self._exists(name):
-            self._bring(name, size)
+            self._fetch_object(name, size)
         yield from super().blocks(name, size)
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:

@@ -43,7 +43,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     Raises `TacpipeError` if jobs cannot be submitted or all end before one has started, and `MissingModuleError` if
     dask-jobqueue is not installed.
     """
-    with extras.explain_missing("The executor slurm"), _interrupts():
+    with extras.explain_missing("The executor slurm"), _restore_interrupts():
         import dask_jobqueue  # noqa: F401, I001  (first: what else is missing comes with it; it adds to Dask's configuration)
         import cryptography  # noqa: F401  (of the certificates)
         import dask
@@ -62,7 +62,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
 
 
 @contextlib.contextmanager
-def _interrupts() -> Iterator[None]:
+def _restore_interrupts() -> Iterator[None]:
     """Restore the handler of Ctrl-C: importing dask-jobqueue replaces it by one that exits with code 0."""
     before = signal.getsignal(signal.SIGINT)
     try:

@@ -94,7 +94,7 @@ class Hdf5Tree:
         ):
             dataset = self._file[array.path]
             if self._available is not None:
-                _expect_there(dataset, self._available)
+                _expect_within_file(dataset, self._available)
             text = h5py.check_string_dtype(dataset.dtype) is not None
             rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
             values = (dataset.asstr(errors="replace") if text else dataset)[rows]
@@ -214,7 +214,7 @@ class _PaddedFile(io.RawIOBase):
         return count
 
 
-def _expect_there(dataset: h5py.Dataset, available: int) -> None:
+def _expect_within_file(dataset: h5py.Dataset, available: int) -> None:
     """Raise `OSError` if bytes of an array are beyond the end of a truncated file, because they would read as zeros."""
     if dataset.chunks is None:
         offset = dataset.id.get_offset()

@@ -356,7 +356,7 @@ class JsonLines:
         schemas: list[pa.Schema] = []
         widths: dict[str, int] = {}
         for block in self._blocks():
-            self._widths(block, widths)
+            self._add_widths(block, widths)
             schemas.append(self._split_lists(block.slice(0, 1)).schema)
         try:
             full_schema = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
@@ -386,7 +386,7 @@ class JsonLines:
             raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
         yield table
 
-    def _widths(self, block: pa.Table, widths: dict[str, int]) -> None:
+    def _add_widths(self, block: pa.Table, widths: dict[str, int]) -> None:
         """Add the length of the lists of each column to ``widths``. Raises `TacpipeError` if lengths differ."""
         for field in block.schema:
             if pa.types.is_list(field.type):
@@ -403,7 +403,7 @@ class JsonLines:
         """Return a table whose list columns of constant length are split into columns."""
         columns: list[tuple[str, pa.ChunkedArray]] = []
         widths: dict[str, int] = {}
-        self._widths(block, widths)
+        self._add_widths(block, widths)
         for name, column in zip(block.column_names, block.columns, strict=True):
             if name in widths:
                 columns += [(f"{name}_{at}", pc.list_element(column, at)) for at in range(widths[name])]

@@ -203,10 +203,10 @@ class Forecaster:
             sizes = len(codec.channels), params.horizon
             quantiles = ForecastQuantiles.load(files[QUANTILES], *sizes) if QUANTILES in files else None
             forecaster = cls(model.eval(), params, config, codec, baselines, codec_files, chain, quantiles)
-            forecaster._try()
+            forecaster._check_parts()
         return forecaster
 
-    def _try(self) -> None:
+    def _check_parts(self) -> None:
         """Predict a window of zeros, to raise an error if parts do not match."""
         fits = {
             "the context": self.context == self.config["context"] > 0,

@@ -60,8 +60,8 @@ def draw(
     upper = figure.add_subplot(grid[0, :])
     lower = figure.add_subplot(grid[1, :], sharex=upper)
     figure.suptitle(headline, x=0.01, ha="left")
-    _loads(upper, recording.table("forecast"), layout, start_ns, horizon_ns)
-    _strips(lower, alarm, (alarm_ns - start_ns) / 1e9, (truth_ns[slips] - start_ns) / 1e9)
+    _draw_loads(upper, recording.table("forecast"), layout, start_ns, horizon_ns)
+    _draw_strips(lower, alarm, (alarm_ns - start_ns) / 1e9, (truth_ns[slips] - start_ns) / 1e9)
     for axes in (upper, lower):
         for begins_ns in slips_ns[:, 0].tolist():
             axes.axvline((begins_ns - start_ns) / 1e9, color=SLIPPED, linewidth=0.6, alpha=0.6)
@@ -94,7 +94,7 @@ def lead_in_words(alarm: Any, begins_ns: int, horizon_ns: int) -> str:
     return f"led by {(begins_ns - on[0]) / 1e6:.0f} ms" if len(on) else "not led"
 
 
-def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -> None:
+def _draw_loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -> None:
     """Draw the shear load of the first skin one row ahead, and the maximum predicted within the horizon."""
     names = list(dict.fromkeys(name.rpartition("_t")[0] for name in table.column_names if "_taxel" in name))
     steps = sorted({int(name.rpartition("_t")[2]) for name in table.column_names if "_taxel" in name})
@@ -119,7 +119,7 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
     axes.tick_params(labelbottom=False)
 
 
-def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> None:
+def _draw_strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> None:
     """Draw when alarms are on and when the object slips."""
     for index, name in enumerate(("load", "slip")):
         state = alarm[f"{name}_state"].to_numpy()

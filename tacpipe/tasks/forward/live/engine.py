@@ -182,7 +182,7 @@ class ForecastEngine(Engine):
         if stream in self.chain.streams or stream == PLAN or stream not in self._first:
             self._decoders[stream].take(block)
         if not self.running and stream not in self._first:
-            self._look(stream)
+            self._record_schema(stream)
 
     def due_ns(self, now_ns: int) -> int:
         """Return when to call `step` next, on the monotonic clock: first to decode, then when a row is due."""
@@ -287,7 +287,7 @@ class ForecastEngine(Engine):
         self._point_ns = self._last_ns = None
         self._why = cause
 
-    def _look(self, stream: str) -> None:
+    def _record_schema(self, stream: str) -> None:
         """Record the schema of a stream's samples before a recording starts."""
         for batch in self._decoders[stream].batches():
             self._first.setdefault(stream, batch_schema(batch, self.sensors[stream]))
