@@ -2,7 +2,7 @@
 
 One command per installed task, with its options and the options of its architectures. A split determines which
 recordings are for training and which for early stopping; ``calibrate``, ``evaluate`` and ``predict`` work with the
-model of any task. An interrupted training continues from its last checkpoint.
+model of any task. An interrupted training run continues from its last checkpoint.
 
 Example: tacpipe train forward data/segments --split data/split -o models/forward
 """

@@ -90,7 +90,7 @@ def options(data: Chunks) -> list[Options]:
 class Camera(Sensor):
     """A camera. If size, pixel format or stamps are omitted, `tacpipe acquire` asks the camera."""
 
-    summary: ClassVar[str] = "Cameras behind a gel (GelSight, DIGIT) and others: MJPEG by V4L2 or by HTTP."
+    summary: ClassVar[str] = "Cameras behind a gel (GelSight, DIGIT) and others: MJPEG through V4L2 or over HTTP."
     links: ClassVar[tuple[str, ...]] = ("v4l2", "mjpeg")
     guesses: ClassVar[Mapping[str, str]] = {
         "width_px": "as the camera sends now",

@@ -161,7 +161,7 @@ def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:
 class Live(Sensor):
     """One stream of a live session."""
 
-    summary: ClassVar[str] = "Messages that `tacpipe live` publishes by UDP: answers of a model, alarms or latencies."
+    summary: ClassVar[str] = "Messages that `tacpipe live` publishes over UDP: answers of a model, alarms or latencies."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False

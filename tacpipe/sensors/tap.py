@@ -1,4 +1,4 @@
-"""A tap: records that other programs send to the recording as lines of JSON by UDP.
+"""A tap: records that other programs send to the recording as lines of JSON over UDP.
 
 A line is one record, such as ``{"width_m": 0.031, "phase": "lift"}``; a packet contains one or more lines. The rig file
 selects keys that become numeric columns; the full record is also stored as text. Special keys: ``seq`` and ``t_ns``, if the
@@ -37,7 +37,7 @@ MAX_INTEGER = 1 << 62  # limit of counters and times
 class Tap(Sensor):
     """Records of a program. A missing key is NaN in its column; records with text instead of a number are rejected."""
 
-    summary: ClassVar[str] = "Records of your programs, sent as lines of JSON by UDP."
+    summary: ClassVar[str] = "Records of your programs, sent as lines of JSON over UDP."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
 

@@ -82,6 +82,6 @@ def _reject_torchrun() -> None:
     size = os.environ.get("WORLD_SIZE", "1")
     if "TORCHELASTIC_RUN_ID" in os.environ and size != "1":
         raise UsageError(
-            f"torchrun has started {size} processes, and one training uses one process and one device. Run the command "
+            f"torchrun has started {size} processes, and a training run uses one process and one device. Run the command "
             f"without torchrun; --jobs trains several folds at the same time, each on a GPU of its own."
         )
