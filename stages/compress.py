@@ -47,9 +47,8 @@ class AutoencoderParams:
     hidden: Annotated[str, CommaList(PositiveInt)] = ""
     # levels: counts above rest; increments: change from the previous row
     representation: Representation = "levels"
-    search: Annotated[int, Range(0, 12)] = (
-        0  # number of networks to try with the same budget; the best is used; 0: no search
-    )
+    # number of networks to try with the same budget; the best is used; 0: no search
+    search: Annotated[int, Range(0, 12)] = 0
     epochs: PositiveInt = 100  # maximum number of passes over the training rows
     batch: PositiveInt = 256  # rows per step of the optimiser
     learning_rate: PositiveFloat = 1e-3  # learning rate of Adam

@@ -50,6 +50,7 @@ FREE = {  # params that are any text, and why
     "train.material.subsample_sensor": "a sensor of recordings",
     "train.material.frozen_sensor": "a sensor of recordings",
     "train.material.run_label": "words for a report",
+    "train.slip.streams": "patterns of streams of recordings",
     "train.slip.forward_model": "the path of a model",
     "train.slip.forward_digest": "the digest of a model",
     "train.touch.run_label": "words for a report",

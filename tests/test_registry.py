@@ -155,7 +155,8 @@ def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab:
     from tacpipe.cli import demo
 
     *commands, last = demo.demo_commands(Path("out"))
-    assert {words[1] for words in commands if words[0] == "train"} == set(registry.tasks())
+    with_demo = {name for name in registry.tasks() if registry.load_task(name).demo(Path("out")) is not None}
+    assert {words[1] for words in commands if words[0] == "train"} == with_demo > {"forward"}
     evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
     assert last[: len(evaluated) + 1] == ["report", *evaluated]
     assert lab.run("--help").out.index("  simulate ") < lab.run("--help").out.index("  export ")
