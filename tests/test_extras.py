@@ -53,7 +53,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
     "segment slips data/even -o {o}",
-    "segment losses data/even -o {o}",
+    "segment losses data/dropped-even -o {o}",
     "segment slides data/touched -o {o}",
     "segment grasps data/pinched -o {o}",
     "split data/segments -o {o} --scheme random",
@@ -96,7 +96,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "limits data/grasps": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
-    "ingest gelsight-slip gels -o {o}": "video",
+    "ingest gelsight-slip gels --rerun -o {o}": "video",
     "simulate gel --trials 1 --duration-s 4 -o {o}": "video",
     "extract difference data/gels -o {o}": "video",
     "extract markers data/gels -o {o}": "video",
@@ -198,7 +198,15 @@ def prepare(folder: Path) -> None:
     (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
-    run_all(folder, ["synchronize data/recordings -o data/even --rate-hz 50"])
+    run_all(
+        folder,
+        (
+            "synchronize data/recordings -o data/even --rate-hz 50",
+            "simulate forward --trials 1 --duration-s 4 -o data/dropped",
+            "label data/dropped trial-000 --label slip=true",
+            "synchronize data/dropped -o data/dropped-even --rate-hz 50",
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
