@@ -1,7 +1,7 @@
 """Looking at a store while a collection removes things from it reports nothing that vanished as damaged."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +107,8 @@ def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_mi
     honest = repair._absent_objects
     looks: list[dict[str, str]] = []
 
-    def with_another(store: Store, soundness: repair.Soundness) -> dict[str, str]:
-        looks.append(honest(store, soundness))
+    def with_another(store: Store, soundness: repair.Soundness, present: Collection[str] = ()) -> dict[str, str]:
+        looks.append(honest(store, soundness, present))
         return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
 
     monkeypatch.setattr(repair, "_absent_objects", with_another)

@@ -159,5 +159,5 @@ def test_shapes_that_do_not_fit_are_told() -> None:
         regression.rmse(np.ones((3, 1)), np.ones((2, 1)))
     with pytest.raises(TacpipeError, match="2 and 2 grasps and clusters of 3"):
         regression.skill_interval(np.ones(2), np.ones(2), np.ones(3))
-    with pytest.raises(TacpipeError, match="A batch of 0"):
+    with pytest.raises(TacpipeError, match="The batch size is 0"):
         regression.batch_mean_rmse(np.ones((3, 1)), np.ones((3, 1)), batch=0)

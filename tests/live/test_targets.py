@@ -131,11 +131,11 @@ def test_the_plan_is_what_the_set_point_did_last_taken_to_continue(
     calls: list[Any] = []
     used = causal.extrapolate_arm
 
-    def without(*arguments: Any) -> Any:
+    def extrapolate_arm(*arguments: Any) -> Any:
         calls.append(arguments)
         return used(*arguments)
 
-    monkeypatch.setattr(causal, "without", without)
+    monkeypatch.setattr(causal, "extrapolate_arm", extrapolate_arm)
     recording = aimed(6)
     fed(model, recording, [])
     robot = recording.tables["robot"]

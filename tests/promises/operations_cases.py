@@ -237,6 +237,11 @@ def _publish(name: str, place: Path) -> None:
         xela_files.write_psc(place / "data_sample_2022-02-21-09-58-49")
 
 
+HELD = (
+    "simulate forward --trials 4 --duration-s 5 --seed 7 --effort 1.15 --robot-rate-hz 50 -o data/r",
+    "label data/r trial-* --label slip=true",
+    "split data/r -o data/split --scheme random --val 0.25 --test 0",
+)
 GELS = (
     "simulate gel --trials 3 --duration-s 4 -o data/g",
     "split data/g -o data/gs --scheme random --val 0 --test 0.34",
@@ -267,6 +272,12 @@ STAGES = (
         sources=lambda lab: _publish("gelsight-slip", lab / "src"),
     ),
     Case("segment.slips", "segment slips data/c -o data/slips", CHAINS["two forward"][:3]),
+    Case("segment.losses", "segment losses data/r -o data/losses --streams xela*", HELD[:2]),
+    Case(
+        "train.slip",
+        "train slip data/r --split data/split --streams xela* -o models/s --trees 3 --leaf 5 --no-match-time",
+        HELD,
+    ),
     Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
     Case(
         "compress.autoencoder",

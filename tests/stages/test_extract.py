@@ -217,7 +217,7 @@ def test_weights_that_are_missing_or_changed_are_refused(tmp_path: Path) -> None
     path.write_bytes(b"none")
     with pytest.raises(UsageError, match="Give the file that was used before"):
         build_params("extract.encoder", weights=str(path), weights_sha256="0" * 64)
-    with pytest.raises(TacpipeError, match="The weights are none of this autoencoder"):
+    with pytest.raises(TacpipeError, match="The weights do not fit this autoencoder"):
         extract({"gel": frames}, "extract.encoder", weights=str(path))
     with pytest.raises(UsageError, match="There is no encoder sparsh"):
         extract({"gel": frames}, "extract.encoder", weights=str(path), encoder="sparsh")

@@ -17,7 +17,7 @@ def test_a_report_is_one_file_with_the_title_asked_for() -> None:
     report_files = REPORT(REPORT.params(title="Monday"), (empty_results,)).files
     assert set(report_files) == {"report.html"}
     assert b"<h1>Monday</h1>" in report_files["report.html"]
-    assert b"No recording was left" in report_files["report.html"]
+    assert b"All recordings were used for training" in report_files["report.html"]
     assert (
         b"<title>Forecasts of tactile signals</title>" in REPORT(REPORT.params(), (empty_results,)).files["report.html"]
     )

@@ -93,7 +93,7 @@ def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
 def test_an_architecture_that_cannot_read_latents_is_refused_before_training(tmp_path: Path) -> None:
     latents = compressed(motion(0))
     latents.recordings["absent"] = None  # reading past the first recording fails here
-    with pytest.raises(TacpipeError, match=r"reads raw channels .* the recordings hold latents"):
+    with pytest.raises(TacpipeError, match=r"reads raw channels.* the recordings contain latents"):
         STAGE(build_params("train.forward", architecture="taxelwise"), latents, latents, tmp_path)
     assert not any(tmp_path.iterdir())
 

@@ -164,7 +164,15 @@ def test_stages_that_train_or_evaluate_can_be_tracked_and_no_others() -> None:
         name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
     }
     assert tracked_stages & built_in == {
-        *("train.forward", "train.material", "train.touch", "compress.autoencoder", "extract.autoencoder", "evaluate"),
+        *(
+            "train.forward",
+            "train.material",
+            "train.slip",
+            "train.touch",
+            "compress.autoencoder",
+            "extract.autoencoder",
+        ),
+        "evaluate",
     }
 
 
