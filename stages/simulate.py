@@ -80,7 +80,7 @@ def forward(params: Params, trial: Trial) -> RecordingOutput:
 class MaterialParams:
     """Surfaces over which the simulated rig slides two different sensors, and the noise of the sensors."""
 
-    # number of recordings, which alternate between BioTac and RoboSkin; 40 contain each sensor and material once
+    # number of recordings, alternating between the sensors; 40 cover each of 20 materials with both sensors
     trials: PositiveInt = 200
     seed: Seed = 0  # random seed
     materials: PositiveInt = 20  # number of materials

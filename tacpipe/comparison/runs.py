@@ -113,7 +113,9 @@ class PredictorErrors:
     """Errors of a run's predictors on one question."""
 
     measure: Measure
-    sums: Mapping[str, Mapping[str, AnyFloats]]  # sums of `Measure` (part,) by predictor and recording
+    sums: Mapping[
+        str, Mapping[str, AnyFloats]
+    ]  # error sums (part,), as defined by `measure`, by predictor and recording
     clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None if each is its own
 
 

@@ -236,7 +236,7 @@ def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]
 
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
-    """Yield the losses of a stream in its messages."""
+    """Yield what is lost when a stream is written as messages: columns without a message type, missing values."""
     import pyarrow as pa
 
     from tacpipe.exports import ros

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 def run_layer(layer: Callable[..., T], inputs: Tensor, *tensors: Any) -> T:
-    """Call a layer, on a GPU in float32, and return its result.
+    """Call a layer and return its result, in float32 where autocast would use float16.
 
     ``inputs`` and ``tensors`` are passed to it; the latter may be tuples of tensors or None. Under `torch.autocast`,
     cuDNN computes recurrent layers in float16 whatever type is requested. Gradients below 6e-8 become zero there,

@@ -30,7 +30,7 @@ class UnrolledCounters:
     missing: Int64s  # number of samples that were lost right before this one
     duplicate: Bools  # the same sample was received before
     late: Bools  # the sample was counted as lost before
-    reset: Bools  # the counter restarted or jumped too far; ``missing`` is then estimated by the clock, or 0
+    reset: Bools  # the counter restarted or jumped too far; ``missing`` is then estimated from the clock, or 0
 
 
 NAMES = tuple(field.name for field in fields(UnrolledCounters))

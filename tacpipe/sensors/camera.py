@@ -97,13 +97,13 @@ class Camera(Sensor):
         "height_px": "as the camera sends now",
     }
 
-    width_px: int = 0  # width of a frame; 0: as the camera is set
-    height_px: int = 0  # height of a frame; 0: as the camera is set
+    width_px: int = 0  # width of a frame; 0: the camera's current setting
+    height_px: int = 0  # height of a frame; 0: the camera's current setting
     rate_hz: float = 0.0  # frames per second; 0: the current setting of a V4L2 camera, unknown for HTTP
     encoding: Literal["mjpeg", "yuyv"] = "mjpeg"  # format from the camera; yuyv is encoded as JPEG, with some loss
-    exposure: int | None = None  # exposure time in 100 us; none: as the camera is set
-    gain: int | None = None  # gain in the camera's units; none: as the camera is set
-    white_balance_k: int | None = None  # colour temperature in kelvin; none: as the camera is set
+    exposure: int | None = None  # exposure time in 100 us; none: the camera's current setting
+    gain: int | None = None  # gain in the camera's units; none: the camera's current setting
+    white_balance_k: int | None = None  # colour temperature in kelvin; none: the camera's current setting
     led: int | None = None  # brightness of a DIGIT's light, 0 to 15, or 256 r + 16 g + b; none: unchanged
     pixel_format: str = ""  # FFmpeg's name of the pixel format; comes from the camera
     stamps: Stamps = ""  # clock of the stamps and whether frames are numbered; comes from the camera

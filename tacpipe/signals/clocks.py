@@ -32,7 +32,7 @@ EARLY_NS = 100_000.0  # smallest distance below the first line at which samples 
 LINE_ROWS, LINE_NS = 32, 2_000_000_000  # smallest number of rows and duration from which a drift is estimated
 HULL_BLOCKS = 512
 MAX_SUBSAMPLE = 1 << 14  # rows for medians and the first line; the envelope uses all rows
-MAX_DRIFT = 0.1  # RC oscillators deviate by a few percent; above, timestamps are not in nanoseconds
+MAX_DRIFT = 0.1  # RC oscillators are off by a few percent; with a larger drift, timestamps cannot be in nanoseconds
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,10 @@ class Episode:
 
 
 def find_episodes(tree: Tree) -> list[Episode]:
-    """Return the recordings of a tree in order, by number if names contain one. Raises `TacpipeError`."""
+    """Return the recordings of a tree in natural order of their names; one unnamed recording for an undivided tree.
+
+    Raises `TacpipeError` if the ends of recordings do not divide the arrays.
+    """
     episodes = _episodes_from_ends(tree)
     if episodes:
         return episodes

@@ -101,9 +101,9 @@ class TextTable:
     stream: StreamLayout
 
     def names(self) -> list[str]:
-        """Return the names of the columns: those of the header, or column1, column2, ….
+        """Return the column names: those declared for the stream, else of the header, else column1, column2, ….
 
-        Raises `TacpipeError` for a file without rows, and for a repeated name.
+        Raises `TacpipeError` for a file without rows, and for a header with repeated or undecodable names.
         """
         for line, cells in self.rows():
             if self.stream.names:

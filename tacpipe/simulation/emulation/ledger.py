@@ -135,9 +135,9 @@ class Ledger:
 
     @property
     def intact_rows(self) -> Int64s:
-        """The rows of entries that were sent unchanged (entry,)."""
+        """Indices of the entries that were sent unchanged (entry,)."""
         codes = np.array([CODES[cause] for cause in UNHARMED])
-        count = len(self)  # common length of all columns, which may grow at the same time
+        count = len(self)  # same length for all columns; another thread may append meanwhile
         size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
         rows: Int64s = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
         return rows

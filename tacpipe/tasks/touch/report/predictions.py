@@ -189,7 +189,7 @@ def _concatenate(parts: Sequence[_TargetRows]) -> _TargetRows:
 
 
 def _skill(rows: _TargetRows, clusters: NDArray[np.str_]) -> Estimate:
-    """Return the skill over the constant on rows that have one."""
+    """Return the skill over the constant, on the rows for which the constant is defined."""
     defined = ~np.isnan(rows.constant).any(axis=1)
     model, baseline = (
         regression.squared_sums(rows.true[defined], values[defined]) for values in (rows.predicted, rows.constant)
