@@ -402,6 +402,7 @@ PARSED = {  # beginnings of examples of the help that are parsed and not run, an
     "view": "opens a window",
 }
 PREPARED = {  # commands that must run before the example of a command
+    "segment losses": ("label data/gels trial-* --label slip=true", "extract difference data/gels -o data/difference"),
     "segment slips": (
         "synchronize data/recordings -o data/even --rate-hz 50",
         "segment contacts data/even -o data/even-contacts",

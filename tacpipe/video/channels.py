@@ -147,7 +147,7 @@ class IntraDecoder:
             return None
         if not frames or (frames[0].width, frames[0].height) != (self._format.width_px, self._format.height_px):
             return None
-        image: Bytes = frames[0].to_ndarray(format=self._pixels)
+        image: Bytes = frames[0].to_ndarray(format=self._pixels, threads=1)
         return image
 
 

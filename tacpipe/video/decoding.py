@@ -46,7 +46,7 @@ def decode_frames(
     if PyAV is not installed.
     """
     for row, frame in _decode(video_format, batches):
-        image: Bytes = frame.to_ndarray(format=GREY if grey else RGB)
+        image: Bytes = frame.to_ndarray(format=GREY if grey else RGB, threads=1)
         yield row, image
 
 
@@ -105,7 +105,7 @@ def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) ->
         group = [row for row in pending if row < stop]
         for index, frame in _decode(video_format, read_batches(columns, start, stop)):
             if start + index in group:
-                images[start + index] = frame.to_ndarray(format=GREY if grey else RGB)
+                images[start + index] = frame.to_ndarray(format=GREY if grey else RGB, threads=1)
         pending = pending[len(group) :]
     return images
 

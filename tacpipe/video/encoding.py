@@ -45,7 +45,7 @@ class JpegEncoder:
 
     def encode(self, frame: Any) -> bytes:
         """Return the JPEG of a frame of PyAV, converted to the encoder's pixel format."""
-        image = frame.reformat(format=self._encoder.pix_fmt)
+        image = frame.reformat(format=self._encoder.pix_fmt, threads=1)
         image.pts, image.time_base = self._count, MICROSECOND
         self._count += 1
         return b"".join(bytes(packet) for packet in self._encoder.encode(image))

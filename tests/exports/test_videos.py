@@ -42,7 +42,7 @@ def decoded(codec: str, packets: list[bytes]) -> list[Bytes]:
     """Return the images of packets that a fresh decoder gets without anything else."""
     context: Any = av.CodecContext.create(codec, "r")
     frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
-    return [frame.to_ndarray(format="rgb24") for frame in [*frames, *context.decode(None)]]
+    return [frame.to_ndarray(format="rgb24", threads=1) for frame in [*frames, *context.decode(None)]]
 
 
 @pytest.mark.parametrize("encoder", PLAYED)

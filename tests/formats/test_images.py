@@ -36,7 +36,7 @@ def encoded(codec: str, pixels: str) -> list[bytes]:
         context: Any = av.CodecContext.create(codec, "w")
         context.width, context.height, context.pix_fmt = videos.WIDTH, videos.HEIGHT, pixels
         context.time_base = MICROSECOND
-        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels)
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels, threads=1)
         packets.append(b"".join(bytes(packet) for packet in [*context.encode(frame), *context.encode(None)]))
     return packets
 

@@ -71,7 +71,7 @@ def write_images(
 def decoded(path: Path) -> list[Bytes]:
     """The images (row, column, rgb) of a file as PyAV decodes them."""
     with av.open(str(path)) as container:
-        return [cast(Any, frame).to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        return [cast(Any, frame).to_ndarray(format="rgb24", threads=1) for frame in container.decode(video=0)]
 
 
 def packets(path: Path) -> list[bytes]:
