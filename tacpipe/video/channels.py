@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.video.decoding import GREY, cell_means, open_decoder
+from tacpipe.video.decoding import GREY, cell_means, open_decoder, padded_packet
 from tacpipe.video.encoding import RGB
 from tacpipe.video.stream import PACKET, VideoFormat
 
@@ -142,7 +142,7 @@ class IntraDecoder:
         import av
 
         try:
-            frames: list[Any] = self._context.decode(av.Packet(packet))
+            frames: list[Any] = self._context.decode(padded_packet(packet))
         except (av.error.FFmpegError, ValueError):
             return None
         if not frames or (frames[0].width, frames[0].height) != (self._format.width_px, self._format.height_px):

@@ -124,9 +124,10 @@ def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[
                     f"Frame {row} cannot be decoded: it is the first to be decoded, and no key frame. Start at a key frame."
                 )
             started = True
-            if not columns[PACKET]:
+            content = columns[PACKET]
+            if not isinstance(content, bytes) or not content:
                 continue
-            packet = av.Packet(columns[PACKET])
+            packet = padded_packet(content)
             packet.pts = packet.dts = row
             packet.is_keyframe = bool(columns[KEY_FRAME])  # FFmpeg would add other PNG images to the previous one
             for frame in context.decode(packet):
@@ -159,6 +160,19 @@ def open_decoder(video_format: VideoFormat) -> Any:
         context.extradata = video_format.extradata
     context.reorder_depth = min(video_format.reorder_frames, MAX_DELAY)
     return context
+
+
+def padded_packet(data: bytes | memoryview) -> Any:
+    """Return a packet of PyAV with a copy of ``data`` and the zero bytes behind it that FFmpeg's decoders may read.
+
+    `av.Packet` of bytes refers to them without such padding, so that the last blocks of a frame depend on whatever
+    follows in memory.
+    """
+    import av
+
+    packet: Any = av.Packet(len(data))
+    packet.update(data)
+    return packet
 
 
 def _row_and_frame(video_format: VideoFormat, frame: Any) -> tuple[int, Any]:

@@ -14,6 +14,7 @@ import zarr
 
 import tacpipe
 from tacpipe.arrays import Bytes
+from tacpipe.video.decoding import padded_packet
 from tacpipe.video.stream import read_format
 from tests.conftest import Lab
 from tests.exports import recordings
@@ -41,7 +42,7 @@ def write(lab: Lab, encoder: str, ending: str, monkeypatch: pytest.MonkeyPatch, 
 def decoded(codec: str, packets: list[bytes]) -> list[Bytes]:
     """Return the images of packets that a fresh decoder gets without anything else."""
     context: Any = av.CodecContext.create(codec, "r")
-    frames = [frame for packet in packets for frame in context.decode(av.Packet(packet))]
+    frames = [frame for packet in packets for frame in context.decode(padded_packet(packet))]
     return [frame.to_ndarray(format="rgb24", threads=1) for frame in [*frames, *context.decode(None)]]
 
 

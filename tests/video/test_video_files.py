@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import pytest
 from hypothesis import given
@@ -169,3 +171,17 @@ def test_metadata_without_a_format_is_one_sentence() -> None:
         stream.VideoFormat.from_metadata({b"codec": b"h264", b"width_px": b"wide"})
     with pytest.raises(TacpipeError, match="no decoder"):
         decoding.open_decoder(stream.VideoFormat("unheard_of", 8, 8, "gray", Fraction(1, 25)))
+
+
+def test_what_follows_a_packet_in_memory_does_not_change_its_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(videos, "OPTIONS", {"mpeg4": {"g": "12", "bf": "2"}})
+    path = videos.write(tmp_path / "gel.avi", "mpeg4", 40)
+    stored = [packet + b"\0\x80" + bytes(62) for packet in videos.packets(path)]  # a resync marker of MPEG-4 follows
+    packets = [memoryview(content)[:-64] for content in stored]
+    context: Any = av.CodecContext.create("mpeg4", "r")
+    context.thread_count = 1
+    frames = [frame for packet in packets for frame in context.decode(decoding.padded_packet(packet))]
+    images = [frame.to_ndarray(format="rgb24", threads=1) for frame in [*frames, *context.decode(None)]]
+    assert np.array_equal(images, videos.decoded(path))
