@@ -289,9 +289,9 @@ def returning_labels(
 
 
 def outgoing(store: Store, directory: Path) -> Manifest | None:
-    """Return the manifest that a publication at ``directory`` replaces, or None if there is none.
+    """Store and return the manifest that a publication at ``directory`` replaces, or return None if there is none.
 
-    It is stored, even if it comes from git or from a copy, so that it can be checked out later.
+    It is also stored if it comes from git or from a copy, so that it can be checked out later.
     """
     try:
         dataset = manifest_of.find(directory)
