@@ -284,7 +284,7 @@ class FrameArray:
 
 
 def arrays_of_frames(columns: Columns, actions: str = "") -> list[FrameArray]:
-    """Return the arrays of a synchronized recording: the time, one per stream and quantity, one per mask, and the actions.
+    """Return the arrays of a synchronized recording: the time, one per stream and quantity, and last the actions, if any.
 
     Columns that are not numbers are omitted.
     """
