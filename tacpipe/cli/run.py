@@ -142,7 +142,7 @@ class _Together:
         return (stage for stage in self._waiting if self._chain.after[stage.name] <= finished)
 
     def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
-        """Start the first remaining command of a stage that is not up to date."""
+        """Start the stage's next command that is not up to date; if none remains, record the outcome of the stage."""
         while commands:
             command = commands.pop(0)
             words = _words(command)
