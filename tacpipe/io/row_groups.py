@@ -175,7 +175,7 @@ class _RowGroup:
     """A group with a maximum number of rows."""
 
     def __init__(self, schema: pa.Schema, rows: int) -> None:
-        self.count = self._spilled = 0  # number of rows, and of rows in the file
+        self.count = self._spilled = 0  # number of rows added, and how many of them are in the file
         self._schema = schema
         self._waiting: list[pa.RecordBatch] = []  # batches in memory, until they are too large
         self._bytes = 0  # size of the waiting batches
