@@ -188,3 +188,23 @@ def _to_json(value: Any, digits: int | None) -> Any:
     if isinstance(value, np.ndarray):
         return value.tolist()
     return value if digits is None else rounded(value, digits)
+
+
+def summarize_latencies(latency_ms: AnyArray) -> dict[str, float]:
+    """Return count, median, 99th percentile, largest, and how many are above 10 and 20 ms; without values only the count.
+
+    >>> summarize_latencies(np.array([1.0, 2.0, np.nan, 12.0]))["above_10_ms"]
+    1
+    """
+    finite = np.asarray(latency_ms, np.float64)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
+        return {"count": 0}
+    return {
+        "count": len(finite),
+        "median_ms": round(float(np.median(finite)), 3),
+        "p99_ms": round(float(np.quantile(finite, 0.99)), 3),
+        "largest_ms": round(float(finite.max()), 3),
+        "above_10_ms": int((finite > 10).sum()),
+        "above_20_ms": int((finite > 20).sum()),
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tacpipe.live import messages
 from tacpipe.tasks.forward.live import measures as truth
 
 
@@ -41,4 +42,4 @@ def test_errors_are_summed_over_rows_and_channels() -> None:
 
 
 def test_latencies_of_no_forecast_are_a_count() -> None:
-    assert truth.quantiles(np.array([np.nan])) == {"count": 0}
+    assert messages.summarize_latencies(np.array([np.nan])) == {"count": 0}

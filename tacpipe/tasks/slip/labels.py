@@ -15,6 +15,7 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Times
 from tacpipe.datasets.intervals import intervals_of
+from tacpipe.signals.runs import runs
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -48,17 +49,17 @@ def read_labels(recording: Recording) -> SlipLabels | None:
         return None
     if any((values < 0).any() for _, values in found):
         return None
-    return SlipLabels(merge_events([runs(t_ns, values > 0) for t_ns, values in found]), contact)
+    return SlipLabels(merge_events([run_times(t_ns, values > 0) for t_ns, values in found]), contact)
 
 
-def runs(t_ns: Times, active: Bools) -> Times:
+def run_times(t_ns: Times, active: Bools) -> Times:
     """Return first and last time of each run of active rows (run, 2).
 
-    >>> runs(np.array([0, 1, 2, 3]), np.array([True, False, True, True])).tolist()
+    >>> run_times(np.array([0, 1, 2, 3]), np.array([True, False, True, True])).tolist()
     [[0, 0], [2, 3]]
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(np.int8)))
-    return np.stack([t_ns[edges[::2]], t_ns[edges[1::2] - 1]], axis=1).astype(np.int64)
+    starts, stops = runs(active)
+    return np.stack([t_ns[starts], t_ns[stops - 1]], axis=1).astype(np.int64)
 
 
 def merge_events(parts: Sequence[Times]) -> Times:

@@ -20,7 +20,7 @@ from tacpipe.tasks import recordings as recordings_of
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.slip.calibration import SlipCalibration
 from tacpipe.tasks.slip.params import SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, load_scorer
+from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer
 from tacpipe.tasks.slip.training import BASELINES, MODEL, labelled_tracks, score_windows, scored_tracks
 from tacpipe.tasks.slip.windows import Finger, FingerReader, GraspTrack, read_windows
 
@@ -65,7 +65,7 @@ class SlipModel:
                 raise ValueError("the model reads no finger")
             reader = FingerReader(fingers, round(params.rest_s * 1e9))
             arrays = model_files.arrays(files[MODEL], MODEL)
-            scorer = load_scorer(config["architecture"], arrays, config["scorer"], reader)
+            scorer = params.load_scorer(arrays, config["scorer"], reader)
             baselines = _load_baselines(files, reader)
             calibration = SlipCalibration.from_config(config["calibration"])
         return cls(config, params, reader, scorer, baselines, calibration, chain)
@@ -74,15 +74,6 @@ class SlipModel:
     def horizon_ns(self) -> int:
         """How far ahead the probability reaches."""
         return round(self.params.horizon_s * 1e9)
-
-    def level(self, per_minute: str) -> float:
-        """Return the score from which an alarm is on. Raises `TacpipeError` for a rate that the model was not set for."""
-        levels = self.calibration.levels
-        if per_minute not in levels:
-            raise TacpipeError(
-                f"The model has alarms at {', '.join(levels)} false alarms per minute, not {per_minute}."
-            )
-        return levels[per_minute]
 
     def predict(self, recordings: Dataset | Recording) -> dict[str, pa.Table] | pa.Table:
         """Return a table with one row per sample of the first finger with full windows; by name for a dataset.

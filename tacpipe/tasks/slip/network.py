@@ -62,9 +62,9 @@ def stack_fingers(windows: Sequence[AnyFloats]) -> Float32s:
 class WindowWork:
     """Training of the network by weighted cross-entropy; every fifth object is held out."""
 
-    def __init__(self, windows: TrainingWindows) -> None:
+    def __init__(self, windows: TrainingWindows, batch: int) -> None:
         _require_equal_rows(windows.reader)
-        self.windows = windows
+        self.windows, self.batch = windows, batch
         held_out = windows.groups % HELD_OUT == HELD_OUT - 1
         self.held_out = np.flatnonzero(held_out)
         self.training = np.flatnonzero(~held_out & (windows.weights > 0))
@@ -93,8 +93,7 @@ class WindowWork:
     def batches(self, epoch: int) -> list[Tensor]:
         """Return shuffled batches of indices of the training windows."""
         order = torch.randperm(len(self.training))
-        batch: int = getattr(self.windows.params, "batch", 128)
-        return list(torch.split(torch.from_numpy(self.training)[order], batch))
+        return list(torch.split(torch.from_numpy(self.training)[order], self.batch))
 
     def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
         """Return the loss of a batch of windows, and its size."""
@@ -129,7 +128,7 @@ class ConvolutionScorer:
     @classmethod
     def fitted(cls, windows: TrainingWindows, params: ConvolutionParams, workspace: Path) -> ConvolutionScorer:
         """Return a network that the shared loop trained."""
-        work = WindowWork(windows)
+        work = WindowWork(windows, params.batch)
         described = {"inputs": work.shape[0], "channels": params.channels, "layers": params.layers}
         schedule = loop.Schedule(
             epochs=params.epochs,

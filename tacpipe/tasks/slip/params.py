@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import (
@@ -22,8 +23,10 @@ from tacpipe.tasks.task import ModelConfig
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tacpipe.arrays import AnyArray
     from tacpipe.tasks.slip.scorers import Scorer
     from tacpipe.tasks.slip.training import SlipTraining
+    from tacpipe.tasks.slip.windows import FingerReader
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,10 @@ class SlipModelParams(ABC):
     def fit(self, training: SlipTraining) -> Scorer:
         """Return a scorer; ``training`` has the windows to train on, and the methods that the task offers."""
 
+    @abstractmethod
+    def load_scorer(self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> Scorer:
+        """Return the scorer that `fit` returned, from its stored parts. Raises `ValueError` if they are inconsistent."""
+
 
 @dataclass(frozen=True)
 class Boosting(SlipModelParams):
@@ -76,6 +83,12 @@ class Boosting(SlipModelParams):
     def fit(self, training: SlipTraining) -> Scorer:
         """Grow the trees."""
         return training.boost(self)
+
+    def load_scorer(self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> Scorer:
+        """Return the stored trees."""
+        from tacpipe.tasks.slip.scorers import BoostedScorer
+
+        return BoostedScorer.load(arrays, described, reader)
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,12 @@ class ConvolutionParams(SlipModelParams):
     def fit(self, training: SlipTraining) -> Scorer:
         """Train the network by the shared loop."""
         return training.train_network(self)
+
+    def load_scorer(self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> Scorer:
+        """Return the stored network."""
+        from tacpipe.tasks.slip.network import ConvolutionScorer
+
+        return ConvolutionScorer.load(arrays, described, reader)
 
 
 @dataclass(frozen=True)
@@ -128,6 +147,12 @@ class ForecastRule(SlipModelParams):
         if not self.forward_model:
             raise UsageError("forward_model names no model. Give the path of a model of the task forward.")
         return training.apply_rule(self)
+
+    def load_scorer(self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> Scorer:
+        """Return the stored rule."""
+        from tacpipe.tasks.slip.rule import RuleScorer
+
+        return RuleScorer.load(arrays, described)
 
 
 def _path(text: str) -> Path:

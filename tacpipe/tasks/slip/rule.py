@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,17 +67,21 @@ class RuleScorer:
     digest: str
     runs_live: bool = False  # the forecasts come from another model
 
+    @cached_property
+    def _forward_model(self) -> Any:
+        """The model, opened once for all tracks."""
+        import tacpipe
+
+        return tacpipe.load(Path(self.path))
+
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
         """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one.
 
         Raises `TacpipeError` for a track without recording.
         """
-        import tacpipe
-
         if track.recording is None:
             raise TacpipeError("The rule needs the recordings of a dataset. Give a dataset instead of a table.")
-        opened: Any = tacpipe.load(Path(self.path))
-        table = opened.predict(track.recording)
+        table = self._forward_model.predict(track.recording)
         scores = np.append(score_forecasts(table), 0.0)
         times = table["t_ns"].to_numpy()
         return scores[np.searchsorted(times, track.t_ns[rows], side="right") - 1]

@@ -111,23 +111,6 @@ def _varies(values: Floats) -> bool:
     return bool(len(finite)) and bool(finite.min() < finite.max())
 
 
-def load_scorer(
-    architecture: str, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader
-) -> Scorer:
-    """Return the scorer of a model's architecture. Raises `ValueError` if it has none."""
-    if "columns" in described:
-        return BoostedScorer.load(arrays, described, reader)
-    if "layers" in described:
-        from tacpipe.tasks.slip.network import ConvolutionScorer
-
-        return ConvolutionScorer.load(arrays, described, reader)
-    if "forward_model" in described:
-        from tacpipe.tasks.slip.rule import RuleScorer
-
-        return RuleScorer.load(arrays, described)
-    raise ValueError(f"the architecture {architecture} has no scorer")
-
-
 def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
     """Return the columns that each baseline reads: the time, shear over load or else the level, and the total change.
 

@@ -13,12 +13,12 @@ from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.slip.features import FingerLayout, combine_fingers, feature_names, finger_features
 from tacpipe.tasks.slip.labels import SlipLabels, read_labels
-from tacpipe.tasks.slip.params import FingerConfig, SlipModelParams
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.tasks.slip.params import FingerConfig, SlipModelParams
 
 STABLE, BEFORE, DURING, UNCOUNTED = 0, 1, 2, -1  # states of a row
 BLOCK = 256  # windows whose features are computed at once

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Int64s, Times
+from tacpipe.live.messages import summarize_latencies
 from tacpipe.tasks.forward import slips
 from tacpipe.tasks.forward.headline import LiveMeasures
 from tacpipe.tasks.forward.slips import Leads, LeadSums
@@ -88,26 +89,6 @@ def sums(predicted: AnyFloats, truth: AnyFloats) -> tuple[Floats, Floats]:
     return np.square(errors).sum(axis=(0, 2)), np.abs(errors).sum(axis=(0, 2))
 
 
-def quantiles(values: AnyFloats) -> dict[str, float]:
-    """Return count, median, 99th percentile, largest, and how many are above 10 and 20; of no value the count alone.
-
-    >>> quantiles(np.array([1.0, 2.0, np.nan, 12.0]))["above_10_ms"]
-    1
-    """
-    finite = np.asarray(values, np.float64)
-    finite = finite[np.isfinite(finite)]
-    if not len(finite):
-        return {"count": 0}
-    return {
-        "count": len(finite),
-        "median_ms": round(float(np.median(finite)), 3),
-        "p99_ms": round(float(np.quantile(finite, 0.99)), 3),
-        "largest_ms": round(float(finite.max()), 3),
-        "above_10_ms": int((finite > 10).sum()),
-        "above_20_ms": int((finite > 20).sum()),
-    }
-
-
 LIVE, LIVE_STILL, OFFLINE, STILL = "live", "live_persistence", "offline", "persistence"
 PREDICTORS = (LIVE, LIVE_STILL, OFFLINE, STILL)
 Sums = dict[str, tuple[Floats, Floats]]  # squared and absolute errors (step,) by predictor
@@ -153,7 +134,7 @@ def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> 
             "of_errors": rows,
         },
         "mae": mae,
-        "latency": quantiles(np.concatenate([session.latency_ms for session in sessions])),
+        "latency": summarize_latencies(np.concatenate([session.latency_ms for session in sessions])),
         "alarms": _pooled([session.alarms for session in sessions]),
     }
 

@@ -24,7 +24,7 @@ from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.slip.calibration import EventScore
-from tacpipe.tasks.slip.labels import SlipLabels, merge_events, runs
+from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
 from tacpipe.tasks.slip.model import SlipModel
 
@@ -96,7 +96,7 @@ def _show(output: Path, world: World, epoch_ns: int) -> Path:
     truth_ns = np.arange(int(t_ns[0]), int(t_ns[-1]), 1_000_000, dtype=np.int64)
     slipping = world.contact(truth_ns - epoch_ns, lambda scene: scene.contact.slip.astype(np.float64)) > 0.5
     track = dataclasses.replace(
-        model.reader.track(recording), labels=SlipLabels(merge_events([runs(truth_ns, slipping)]), None)
+        model.reader.track(recording), labels=SlipLabels(merge_events([run_times(truth_ns, slipping)]), None)
     )
     answered = stream["alarm"].to_numpy() >= 0
     alarms = score_session(model, track, t_ns[answered], stream["alarm"].to_numpy()[answered] > 0)

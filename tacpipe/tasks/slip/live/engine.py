@@ -78,9 +78,13 @@ class FingerSoFar:
             self._dropped += len(self.t_ns) - kept
             self.t_ns, self.values = self.t_ns[-kept:], self.values[-kept:]
 
+    def newest_row(self, t_ns: int) -> int:
+        """Return the index of the newest row at a time; -1 before the first one."""
+        return int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
+
     def window(self, t_ns: int) -> AnyFloats | None:
         """Return the window (time, channel) of the newest row at a time, or None if it is not full."""
-        row = int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
+        row = self.newest_row(t_ns)
         if row + self._dropped < self._begin + self.finger.rows - 1 or row + 1 < self.finger.rows:
             return None
         return self.values[row + 1 - self.finger.rows : row + 1]
@@ -221,7 +225,7 @@ class SlipEngine(Engine):
         full = [window for window in windows if window is not None]
         score = self._model.scorer.score_window(self._model.reader, full)
         probability = float(self._model.calibration.probability(np.array([score]))[0])
-        newest = [int(so_far.t_ns[so_far.t_ns <= t_ns][-1]) for so_far in self._fingers.values()]
+        newest = [int(so_far.t_ns[so_far.newest_row(t_ns)]) for so_far in self._fingers.values()]
         state = ON if score >= self._level else OFF
         touch = {
             finger.stream: np.round(taxel_sizes(finger, window[-1]), DIGITS).tolist()

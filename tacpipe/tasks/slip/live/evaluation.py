@@ -11,6 +11,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Times
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
+from tacpipe.live.messages import summarize_latencies
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.live.messages import SLIP
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
-LIMITS_MS = (10, 20)
 
 
 def evaluate(model: Model, recordings: Dataset) -> Result:
@@ -66,32 +66,17 @@ def _session(model: SlipModel, recording: Recording) -> dict[str, Any]:
     for name in ("probability", "score"):
         sent, computed = published[name][answered][ours], predicted[name].to_numpy()[theirs]
         same &= sent.view(np.int64) == computed.view(np.int64)
-    latency_ms = recording.table("latency")["latency_ms"].to_numpy()
-    latency_ms = latency_ms[np.isfinite(latency_ms)]
     session: dict[str, Any] = {
         "published": int(answered.sum()),
         "compared": len(ours),
         "equal": int(same.sum()),
-        "latency": _quantiles(latency_ms),
+        "latency": summarize_latencies(recording.table("latency")["latency_ms"].to_numpy()),
     }
     track = model.reader.track(recording)
     if track.labels is not None:
         alarms = score_session(model, track, times, published["alarm"][answered] > 0)
         session["alarms"] = alarms.to_json()
     return session
-
-
-def _quantiles(latency_ms: Any) -> dict[str, float]:
-    """Return count, median, 99th percentile and maximum, and how many are above each limit."""
-    if not len(latency_ms):
-        return {"count": 0}
-    return {
-        "count": len(latency_ms),
-        "median_ms": round(float(np.median(latency_ms)), 3),
-        "p99_ms": round(float(np.quantile(latency_ms, 0.99)), 3),
-        "largest_ms": round(float(latency_ms.max()), 3),
-        **{f"above_{limit}_ms": int((latency_ms > limit).sum()) for limit in LIMITS_MS},
-    }
 
 
 @dataclass(frozen=True)

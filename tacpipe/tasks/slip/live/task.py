@@ -88,7 +88,7 @@ class SlipLive(LiveTask):
             loaded,
             {finger.stream: sensors[finger.stream] for finger in fingers},
             description,
-            loaded.level(name),
+            loaded.calibration.levels[name],
             settle_ns=round(settings.settle_ms * 1e6),
         )
 
@@ -123,7 +123,9 @@ def _require_recorded(model: Model) -> None:
 
 def _level_name(levels: Mapping[str, float], per_minute: float) -> str:
     """Return the name of the level for a rate of false alarms. Raises `UsageError` if the model has none."""
-    name = f"{per_minute:g}"
+    from tacpipe.tasks.slip.calibration import rate_name
+
+    name = rate_name(per_minute)
     if name not in levels:
         raise UsageError(f"The model has alarms at {', '.join(levels)} false alarms per minute. Choose one of these.")
     return name
