@@ -27,14 +27,31 @@ import numpy as np
 import tacpipe
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
+from tacpipe.sensors import plan as plans
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
-from tacpipe.tasks.forward.live.demo import EFFORT, SEED, SWITCH_S, send_plans
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
+EFFORT = 1.15  # maximum load of the plan, relative to the friction limit: the plan of each trial causes slip
+SEED = 7
+AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # length of a plan, interval between plans, interval between its points
+SWITCH_S = 0.0005
 LOOK_S = 2.0  # Pause between two looks at memory.
 SETTLED_S = 20.0  # Time after the start from which memory is compared.
+
+
+def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
+    """Send the future motion of the emulated hand, as a controller would."""
+    import socket
+
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
+        while not is_over.wait(EVERY_S):
+            since_ns = time.monotonic_ns() - emulator.epoch_ns
+            t_ns = since_ns + np.arange(0, round(AHEAD_S * 1e9), round(POINT_S * 1e9), dtype=np.int64)
+            poses = emulator.world.arm(t_ns)[:, 1:]
+            planner.sendto(plans.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses), ("127.0.0.1", port))
 
 
 def memory_mb(process: int) -> float:
