@@ -12,6 +12,7 @@ Example: tacpipe segment losses data/difference -o data/losses
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,6 +52,7 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
     import pyarrow as pa
 
     from tacpipe.channels import schema as schemas
+    from tacpipe.codecs import tactile
     from tacpipe.signals.slip import TouchLimits, loss_of_contact
 
     slipped = recording.attributes.get("slip")
@@ -60,7 +62,8 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
             f"`tacpipe label DATASET {recording.name} --label slip=true`."
         )
     tables = {stream: recording.table(stream) for stream in recording.streams}
-    touches = {stream: _tactile(recording.name, table) for stream, table in tables.items() if _has_touch(table)}
+    channels = {stream: tactile.columns(table.schema, "tactile") for stream, table in tables.items()}
+    touches = {stream: _touch(recording.name, tables[stream], names) for stream, names in channels.items() if names}
     if not touches:
         raise TacpipeError(
             f"Recording {recording.name} has no tactile channel. Run `tacpipe extract difference` on videos of gels first."
@@ -98,16 +101,12 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
     )
 
 
-def _has_touch(table: pa.Table) -> bool:
-    return any((field.metadata or {}).get(b"quantity") == b"tactile" for field in table.schema)
-
-
-def _tactile(name: str, table: pa.Table) -> tuple[Times, Floats]:
+def _touch(name: str, table: pa.Table, channels: Sequence[str]) -> tuple[Times, Floats]:
     """Return times and tactile channels (time, channel) of a stream, with NaN as 0."""
     import numpy as np
 
-    fields = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
+    from tacpipe.codecs import tactile
+
     if table.num_rows < 2:
         raise TacpipeError(f"Recording {name} has {table.num_rows} rows; a loss shows in two or more. Leave it out.")
-    values = np.stack([table[field].to_numpy(zero_copy_only=False).astype(np.float64) for field in fields], axis=1)
-    return table["t_ns"].to_numpy(), np.nan_to_num(values)
+    return table["t_ns"].to_numpy(), np.nan_to_num(tactile.matrix(table, channels))

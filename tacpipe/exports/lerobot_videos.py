@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
@@ -20,6 +21,7 @@ import numpy as np
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
 from tacpipe.video.stream import (
+    BATCH_ROWS,
     DTS,
     KEY_FRAME,
     PACKET,
@@ -135,20 +137,17 @@ class EpisodeVideo:
         is_later = np.abs(t_ns[later] - grid_ns) < np.abs(t_ns[after - 1] - grid_ns)
         return cls(columns, video_format, np.where(is_later, later, after - 1).astype(np.int64), codec, fps)
 
-    @property
+    @cached_property
     def is_copied(self) -> bool:
         """Whether packets are copied: the codec is that of the dataset, and each row has the next frame."""
         if self.video_format.codec != self.codec or not len(self.rows) or (np.diff(self.rows) != 1).any():
             return False
-        clocks = self.columns.read([DTS, KEY_FRAME, PACKET])
-        if any(not packet for packet in clocks.column(PACKET).to_pylist()):
-            return False
         start, stop = int(self.rows[0]), int(self.rows[-1]) + 1
-        key_frame = clocks.column(KEY_FRAME).to_numpy(zero_copy_only=False)
-        return bool(key_frame[start]) and cut_rows(clocks.column(DTS).to_numpy(), key_frame, start, stop) == (
-            start,
-            stop,
-        )
+        dts, key_frame = self._clocks()
+        if not key_frame[start] or cut_rows(dts, key_frame, start, stop) != (start, stop):
+            return False
+        packets = (batch.column(PACKET) for batch in self.columns.batches([PACKET], BATCH_ROWS))
+        return all(packet for column in packets for packet in column.to_pylist())
 
     def losses(self, stream: str, ending: str) -> Iterator[Loss]:
         """Yield the losses of the stream in the video; ``ending`` completes each reason."""

@@ -26,15 +26,11 @@ def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset
 
     A frame is in the middle of its recording, or of the recording's part in another of ``datasets``, such as a slide.
     """
-    recordings = {
-        name: recording for dataset in datasets for name, recording in dataset.recordings.items() if _cameras(recording)
-    }
-    parts = {
-        name: recording
-        for dataset in datasets
-        for name, recording in dataset.recordings.items()
-        if not _cameras(recording)
-    }
+    recordings: dict[str, Recording] = {}
+    parts: dict[str, Recording] = {}
+    for dataset in datasets:
+        for name, recording in dataset.recordings.items():
+            (recordings if _cameras(recording) else parts)[name] = recording
     seen = [outcome for outcome in outcomes if outcome.recording in recordings]
     blocks = []
     for title, is_right in (("Right", True), ("Wrong", False)):

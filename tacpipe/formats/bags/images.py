@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from tacpipe.formats.container import Batched
 from tacpipe.video.images import PICTURE, RAW_FORMATS, raw_format
@@ -43,11 +44,12 @@ def _raw_images(content: Batched) -> Batched:
     present = [name for name in LAYOUT if name in content.schema.names]
     if not {"height", "width", "encoding", "step"} <= set(present):
         return content
-    layouts = {
-        tuple(layout.values())
-        for table in content.read()
-        for layout in table.select(present).group_by(present).aggregate([]).to_pylist()
-    }
+    layouts, sizes = set(), set()
+    for table in content.read():
+        layouts |= {
+            tuple(layout.values()) for layout in table.select(present).group_by(present).aggregate([]).to_pylist()
+        }
+        sizes |= set(pc.unique(pc.binary_length(table.column(PICTURE))).to_pylist())
     if len(layouts) != 1:
         return content
     layout = dict(zip(present, layouts.pop(), strict=True))
@@ -56,7 +58,6 @@ def _raw_images(content: Batched) -> Batched:
     if video_format is None:
         return content
     row_bytes = width * RAW_FORMATS[layout["encoding"]][1]
-    sizes = {len(image) for table in content.read() for image in table.column(PICTURE).to_pylist()}
     if step < row_bytes or sizes != {step * height}:
         return content
     declared = _add_metadata(content, video_format.to_metadata(), tuple(present))
