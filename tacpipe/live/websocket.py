@@ -31,7 +31,7 @@ QUEUED = 16  # messages queued per subscriber; a third of a second at 50 Hz
 QUEUED_BYTES = 1 << 20  # limit of their size
 SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
 BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
-# limits for a client: initial messages for its request, then messages per second
+# bytes that a client may send: for its request, then per second
 RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
 # The page comes from one file, and connects to its own server only.
 PAGE_HEADERS = {

@@ -78,7 +78,7 @@ class Pair:
 
     sums: AnyFloats  # (seed, cluster, part): those of the predictor, then those of the baseline
     names: tuple[str, ...]  # names of the clusters
-    jackknife: Jackknife  # of the gain, or for skill of the negative logarithm of the ratio of errors
+    jackknife: Jackknife  # jackknife of the gain; for skill, of the negative log ratio of errors
     effective: float
     counted: int  # number of clusters with a positive weight
 

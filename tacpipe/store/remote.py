@@ -88,7 +88,7 @@ class RemoteStore:
     def _expect_conditional(self) -> None:
         tried = f"tmp/.{uuid.uuid4().hex}"
         self.files.create(tried, b"1")
-        # with other content, so that a lost response does not count as success
+        # the content differs, so that a lost response does not count as success
         replaced = self.files.create(tried, b"2")
         self.files.delete(tried)
         if replaced:

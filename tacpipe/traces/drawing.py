@@ -16,7 +16,7 @@ from tacpipe.traces.taxels import Taxels
 
 # distinguishable with red-green colour blindness (Okabe and Ito), and bright enough for a dark background
 DISTINCT = ("#56b4e9", "#e69f00", "#35b779", "#f0e442", "#cc79a7", "#d55e00", "#8c9eff", "#9aa5b1")
-# for a light background
+# colours on a light background
 PRINTED = ("#0969da", "#d1480c", "#1a7f37", "#8250df", "#bf8700", "#0e7490", "#bf3989", "#57606a")
 AXES = ("#e8604c", "#5fbf60", "#5b8ff9", "#c9a227")  # x, y, z, w, as usual in robotics tools
 FAULT = "#e5484d"  # gaps and events

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray, ArrayType, Int64s
 
-START, END = b"\xff\xd8", b"\xff\xd9"  # of a JPEG image
+START, END = b"\xff\xd8", b"\xff\xd9"  # first and last bytes of a JPEG image
 END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
-# by ratio of luma to chroma
+# pixel formats by the ratio of luma to chroma samples, (horizontal, vertical)
 PIXEL_FORMATS = {(1, 1): "yuvj444p", (2, 1): "yuvj422p", (2, 2): "yuvj420p", (1, 2): "yuvj440p"}
 
 

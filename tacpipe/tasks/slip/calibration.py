@@ -1,7 +1,7 @@
 """Calibrate scores to probabilities by isotonic regression, and set alarm levels by their false alarms.
 
-SlipCalibration uses scores of recordings that the scorer was not trained on: those of validation, and out-of-fold scores of
-training recordings, where each fold leaves out whole objects. An alarm is on while the score is at its level or above. A
+Calibration uses scores of recordings outside the training set: those of validation, and out-of-fold scores of training
+recordings, where each fold leaves out whole objects. An alarm is on while the score is at its level or above. A
 false alarm counts for the horizon after it begins, as long as it warns.
 """
 
@@ -153,9 +153,9 @@ class EventScore:
     name: str  # recording
     object: str
     begins_s: float  # since the start of the recording
-    lead_ms: float  # from the first alarm within the horizon before the slip; NaN: none before
-    detected_ms: float  # from the slip's start to the first alarm; NaN: none before its end
-    to_end_ms: float  # from the first alarm to the end of the slip; NaN: no alarm
+    lead_ms: float  # time from the first alarm in the horizon before the slip; NaN without one
+    detected_ms: float  # time from the slip's start to the first alarm; NaN without one before its end
+    to_end_ms: float  # time from the first alarm to the end of the slip; NaN without an alarm
 
 
 def score_events(track: ScoredTrack, level: float, horizon_ns: int) -> list[EventScore]:

@@ -38,7 +38,7 @@ NAMES = (
 
 @dataclass(frozen=True)
 class FingerLayout:
-    """Where the channels of a finger lie: indices (taxel,) of each axis, empty for an axis that is not measured."""
+    """Indices (taxel,) of the channels of a finger along each axis; empty for an axis that is not measured."""
 
     shear: tuple[Indices, Indices]
     normal: Indices

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 ATTRIBUTE = "slip_intervals"
-COLUMNS = ("slip", "slip_slip", "gt_slip")  # of the stages, of a synchronized label stream, of the simulator
+COLUMNS = ("slip", "slip_slip", "gt_slip")  # columns of stages, synchronized label streams and the simulator
 CONTACT = "contact"  # column of `segment contacts` and `segment losses`; negative without contact
 MERGED_NS = 200_000_000  # slips that are closer than this are one event
 

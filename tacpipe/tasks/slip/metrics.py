@@ -42,8 +42,8 @@ class SlipAlarmScore(TypedDict):
     events: int
     predicted: int  # slips with an alarm before they began
     detected: int  # slips with an alarm before they ended, including predicted ones
-    median_lead_ms: float | None  # of predicted slips, from the alarm to the start of the slip
-    median_to_end_ms: float | None  # of detected slips, from the alarm to the end of the slip
+    median_lead_ms: float | None  # time from the alarm to the start of the slip, for predicted slips
+    median_to_end_ms: float | None  # time from the alarm to the end of the slip, for detected slips
     false_alarms: int
     minutes: float  # stable contact
     false_alarms_per_minute: float | None
@@ -119,7 +119,7 @@ class WindowScores:
     def area(self, name: str) -> Area:
         """Return the area under the curve of a part, as sums by object.
 
-        WindowScores of the part within are compared in each recording only.
+        Windows of the part within are compared in each recording only.
         """
         counted, positive = self.part(name)
         weights = np.ones(len(self.scores)) if name in ("within", "early") else self.weights

@@ -59,8 +59,8 @@ class SlipTask(Task):
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 
-        It states the probability that the object slips within the next second, and reads the last second of all tactile
-        streams. Validation recordings set the levels of alarms.
+        The model reads the last second of all tactile streams and returns the probability that the object slips within
+        the next second. Alarm levels are set on validation recordings.
 
         Example: tacpipe train slip data/slips --split data/split -o models/slip
         """

@@ -356,7 +356,7 @@ def _tactile_tables(recording: Recording, streams: str) -> Iterator[tuple[str, p
 
 @dataclass(frozen=True)
 class TrainingWindows:
-    """WindowScores to train on, with their labels."""
+    """Windows to train on, with their labels."""
 
     reader: FingerReader
     tracks: tuple[GraspTrack, ...]
@@ -411,7 +411,7 @@ def read_windows(
 def match_time(since_s: Floats, slips: Bools) -> Floats:
     """Return weights (window,) that give windows with and without a slip the same distribution of time since the start.
 
-    WindowScores with a slip have weight 1. Those without one get the total weight that they have in all bins with a slip,
+    Windows with a slip have weight 1. Those without one get the total weight that they have in all bins with a slip,
     distributed over the bins as the windows with a slip are; a bin without a slip has no weight.
 
     >>> match_time(np.array([0.5, 0.5, 0.5, 1.5]), np.array([True, False, False, False])).tolist()

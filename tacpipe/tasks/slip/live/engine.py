@@ -29,9 +29,9 @@ from tacpipe.tasks.slip.windows import Finger, fill_missing, measure_rest
 
 EVERY_NS = 1_000_000  # time between two looks at new samples
 BEHIND = 4  # probabilities that are computed at once; older ones are skipped
-SILENT_NS = 250_000_000  # time without a sample after which a message states it
+SILENT_NS = 250_000_000  # time without a sample after which a message reports it
 SPARE_ROWS = 512  # rows that are kept in addition to a window
-DIGITS = 4  # of published touch
+DIGITS = 4  # decimal places of published touch
 
 
 @dataclass(frozen=True)
