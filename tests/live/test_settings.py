@@ -11,9 +11,9 @@ import pytest
 
 from tacpipe.cli import live as command
 from tacpipe.errors import UsageError
+from tacpipe.live import plans
 from tacpipe.live.settings import SessionOptions, Settings, keys, task_settings
 from tacpipe.recording import rig as rigs
-from tacpipe.tasks.forward.live import plans
 from tacpipe.tasks.forward.live.task import ForwardSettings
 from tests.conftest import Lab
 from tests.live.sessions import TRAINED

@@ -6,13 +6,12 @@ a forecast must not depend on how many rows arrived together.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Times
 from tacpipe.codecs.codec import INCREMENTS
+from tacpipe.live.plans import PosePlan
 from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import vectors_to_quaternions
@@ -176,13 +175,6 @@ class Rolling:
         """Return the current rows and the arm's planned ones as one window."""
         parts = (self._latent, np.concatenate([self._arm, plan.astype(np.float32)]), self._finger)
         return ForecastWindows(*(torch.from_numpy(part[:, None].copy()) for part in parts))
-
-
-class PosePlan(NamedTuple):
-    """Planned poses of the hand: times, and positions in m with quaternions x, y, z, w."""
-
-    t_ns: Times  # (point,), ascending
-    poses: Floats  # (point, 7); the hand does not turn if a quaternion is not finite
 
 
 def rows(plan: PosePlan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:

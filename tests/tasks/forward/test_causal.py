@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tacpipe.live.plans import PosePlan
 from tacpipe.models.windows import POSE
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import causal, tracks
-from tacpipe.tasks.forward.causal import Arm, PosePlan
+from tacpipe.tasks.forward.causal import Arm
 from tests.tasks.forward import trials
 
 T_NS = np.arange(60) * 20_000_000

@@ -19,15 +19,15 @@ from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.live.extraction import live_channels
+from tacpipe.live.plans import PlanHistory
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
-from tacpipe.sensors.plan import POSE
 from tacpipe.signals.resampling import GAP_NS
 from tacpipe.synchronization.causal import Grid, GridRows
 from tacpipe.tasks.forward import causal, headline
-from tacpipe.tasks.forward.causal import Arm, PosePlan, Rolling
+from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.inputs import InputLayout, plan_table
 from tacpipe.tasks.forward.live.plans import Targets, facing
@@ -145,7 +145,7 @@ class LiveChain:
             [] if beginning is None else None
         )  # rows collected until the rest level is known
         self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
-        self._plans: deque[tuple[int, list[Floats]]] = deque()  # arrival, and rows of time and pose
+        self._plans = PlanHistory()
         self._late_plans = 0
         self._until_ns: int | None = None
         period_ns = 1e9 / self.rate_hz
@@ -391,12 +391,10 @@ class LiveChain:
             aimed = self._targets.state(t_ns)
             cause = Cause.NO_PLAN if aimed is None else Cause.NONE
             return causal.extrapolate_arm(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
-        while len(self._plans) > 1 and self._plans[1][0] <= t_ns:
-            self._plans.popleft()
-        if not self._plans or self._plans[0][0] > t_ns:
+        self._plans.forget_before(t_ns)
+        plan = self._plans.newest(t_ns)
+        if plan is None:
             return causal.extrapolate_arm(t_ns, ahead_ns, now), Cause.NO_PLAN
-        rows = np.concatenate(self._plans[0][1])
-        plan = PosePlan(rows[:, 0].view(np.int64), rows[:, 1:])
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
         return causal.rows(plan, t_ns, ahead_ns, now), cause
 
@@ -413,20 +411,9 @@ class LiveChain:
         return steps_ns
 
     def _push_plans(self, batch: pa.RecordBatch | pa.Table | BatchColumns) -> None:
-        """Add rows of plans; rows of the same arrival are one plan, also if they are in several batches."""
-        if not self.reads_plan or not batch.num_rows:
+        """Add rows of plans."""
+        if not self.reads_plan:
             return
-        names = batch.schema.names
-        arrived = np.asarray(batch.column(names.index("t_ns")))
-        # times as the bits of floats, so that a plan's rows are one array
-        target = np.ascontiguousarray(batch.column(names.index("t_target_ns"))).view(np.float64)
-        poses: Floats = np.column_stack([np.asarray(batch.column(names.index(name))) for name in POSE])
-        rows = np.column_stack([target, poses])
-        for arrived_ns in np.unique(arrived).tolist():
-            plan_rows = rows[arrived == arrived_ns]
-            if self._until_ns is not None and arrived_ns <= self._until_ns:
-                self._late_plans += 1
-            if self._plans and self._plans[-1][0] == arrived_ns:
-                self._plans[-1][1].append(plan_rows)
-            else:
-                self._plans.append((arrived_ns, [plan_rows]))
+        arrivals = self._plans.push(batch)
+        if self._until_ns is not None:
+            self._late_plans += int((arrivals <= self._until_ns).sum())

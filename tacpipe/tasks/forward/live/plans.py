@@ -1,4 +1,4 @@
-"""Read the planned motion of a live session from a controller that sends it, or from the set-points of an arm.
+"""Read the planned motion of a live session from the set-points of an arm.
 
 A set-point is the pose at which the hand should be now, not later; its recent motion is assumed to continue. It does
 not have the noise of measured positions, and is ahead of the hand by the lag of the arm's controller.
@@ -6,9 +6,7 @@ not have the noise of measured positions, and is ahead of the hand by the lag of
 
 from __future__ import annotations
 
-import ipaddress
 from collections import deque
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,91 +15,11 @@ from tacpipe.arrays import Float32s, Floats
 from tacpipe.channels.arm import metres_per_unit
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.errors import UsageError
-from tacpipe.links import network
-from tacpipe.links.link import Address
 from tacpipe.models.windows import POSE
-from tacpipe.printable import excerpt, listed, plain
-from tacpipe.recording import rig as rigs
-from tacpipe.recording.rig import Rig, RigStream
-from tacpipe.sensors.plan import MEASURED
-from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.signals import kinematics
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-LOCAL = "127.0.0.1"  # default host of plans by UDP
-RIG = "rig"  # scheme of a plan from a stream of the rig
-
-
-def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
-    """Return a rig with a stream of plans from an address; unchanged for ``measured`` or a stream of the rig.
-
-    ``sender`` is the only IP address from which plans are accepted by UDP; it is required for a port that other
-    computers can reach. Raises `UsageError` if the address is invalid, or the rig already has a stream of that name or
-    lacks the given one.
-    """
-    if sender:
-        _check_sender(sender, plan)
-    if plan == MEASURED or target_stream(rig, plan):
-        return rig
-    if PLAN in rig.streams:
-        raise UsageError(f"The rig file has a stream {PLAN} already; leave --plan out, and its plans are read.")
-    scheme, colon, place = plan.partition(":")
-    if scheme not in ("udp", "ws") or not colon or not place:
-        raise UsageError(
-            f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT, ws:HOST:PORT or rig:STREAM."
-        )
-    if scheme == "udp":
-        place = _restrict_address(place, sender)
-    stream = RigStream(PLAN, "plan", rigs.build_sensor("plan", {}, "--plan"), Address(scheme, place))
-    return replace(rig, streams={**rig.streams, PLAN: stream})
-
-
-def _check_sender(sender: str, plan: str) -> None:
-    try:
-        ipaddress.ip_address(sender)
-    except ValueError:
-        raise UsageError(f"--plan-from {excerpt(sender)} is not an IP address, as 192.168.1.20.") from None
-    if not plan.startswith("udp:"):
-        raise UsageError(f"--plan-from {excerpt(sender)} has no effect without --plan udp:HOST:PORT.")
-
-
-def _restrict_address(place: str, sender: str) -> str:
-    """Return the address of a UDP port that accepts plans from this computer, or from the sender, only."""
-    place, _, option = place.partition("?")
-    if option and sender:
-        raise UsageError(f"--plan-from {excerpt(sender)}: leave ?{plain(option)} of --plan out.")
-    host, port = network.parse_host_port("udp", place)
-    host = host or LOCAL
-    if sender:
-        option = f"sender={sender}"
-    elif not option and not _is_loopback(host):
-        raise UsageError(
-            f"--plan udp:{place} is reached by other computers, and a plan changes forecasts and alarms; give the address "
-            f"of the controller with --plan-from, or listen to this computer with udp::{port}."
-        )
-    return (f"[{host}]:{port}" if ":" in host else f"{host}:{port}") + (f"?{option}" if option else "")
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def target_stream(rig: Rig, plan: str) -> str:
-    """Return the stream in ``rig:STREAM``, or empty for any other source. Raises `UsageError` if there is no such stream."""
-    scheme, _, stream = plan.partition(":")
-    if scheme != RIG:
-        return ""
-    if stream not in rig.streams:
-        raise UsageError(
-            f"--plan {excerpt(plan)}: the rig has no stream {excerpt(stream)}; it has {listed(rig.streams)}."
-        )
-    return stream
-
 
 POSITION, ORIENTATION = "target_position", "target_orientation"  # quantities
 SPAN_NS = 20_000_000  # span over which the set-point's speed is computed

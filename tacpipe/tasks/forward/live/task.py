@@ -82,8 +82,8 @@ class ForwardLive(LiveTask):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans if needed."""
         from tacpipe.datasets import model_files
+        from tacpipe.live import plans
         from tacpipe.tasks import task
-        from tacpipe.tasks.forward.live import plans
         from tacpipe.tasks.forward.live.alarms import NAMES
         from tacpipe.tasks.forward.live.stages import refuse_look_ahead
 
@@ -120,8 +120,8 @@ class ForwardLive(LiveTask):
 
         Raises `UsageError` for steps that the model does not predict.
         """
+        from tacpipe.live import plans
         from tacpipe.tasks.forward.forecaster import Forecaster
-        from tacpipe.tasks.forward.live import plans
         from tacpipe.tasks.forward.live.chain import LiveChain
         from tacpipe.tasks.forward.live.engine import ForecastEngine
 
