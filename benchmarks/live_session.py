@@ -27,31 +27,18 @@ import numpy as np
 import tacpipe
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
-from tacpipe.sensors import plan as plans
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.simulation.emulation.planner import send_plans
 from tacpipe.simulation.emulation.world import World
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
 EFFORT = 1.15  # maximum load of the plan, relative to the friction limit: the plan of each trial causes slip
 SEED = 7
-AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # length of a plan, interval between plans, interval between its points
+PLAN_RATE_HZ = 10.0  # plans per second
 SWITCH_S = 0.0005
 LOOK_S = 2.0  # Pause between two looks at memory.
 SETTLED_S = 20.0  # Time after the start from which memory is compared.
-
-
-def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
-    """Send the future motion of the emulated hand, as a controller would."""
-    import socket
-
-    offset_ns = time.time_ns() - time.monotonic_ns()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
-        while not is_over.wait(EVERY_S):
-            since_ns = time.monotonic_ns() - emulator.epoch_ns
-            t_ns = since_ns + np.arange(0, round(AHEAD_S * 1e9), round(POINT_S * 1e9), dtype=np.int64)
-            poses = emulator.world.arm(t_ns)[:, 1:]
-            planner.sendto(plans.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses), ("127.0.0.1", port))
 
 
 def memory_mb(process: int) -> float:
@@ -94,9 +81,6 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         (folder / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
         gc.collect()
         gc.disable()  # a collection of the emulator's memory stops what a real rig would not stop
-        session_ended = threading.Event()
-        planner = threading.Thread(target=send_plans, args=(emulator, port, session_ended), daemon=True)
-        planner.start()
         words = ["live", str(folder / "emulated" / "rig.toml"), "--model", str(arguments.model), "--quiet", "--json"]
         words += [
             "--plan",
@@ -110,12 +94,11 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         words += ["--realtime"] * arguments.realtime
         words += [word for address in arguments.publish for word in ("--publish", address)]
         command = [sys.executable, "-m", "tacpipe", *words]
-        session = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        watcher = threading.Thread(target=watch_memory, args=(session, memory), daemon=True)
-        watcher.start()
-        printed, _ = session.communicate()
-        session_ended.set()
-        planner.join()
+        with send_plans(emulator, port, PLAN_RATE_HZ):
+            session = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            watcher = threading.Thread(target=watch_memory, args=(session, memory), daemon=True)
+            watcher.start()
+            printed, _ = session.communicate()
     return json.loads(printed), memory
 
 

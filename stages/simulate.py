@@ -17,6 +17,7 @@ from tacpipe.plugins.constraints import (
     Seed,
     Unit,
 )
+from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
 Families = Annotated[
@@ -56,6 +57,8 @@ class Params:
     # maximum offset of the sensors' own clocks (t_device_ns)
     clock_offset_ms: Annotated[NonNegativeFloat, Unit("ms")] = 80.0
     clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # maximum skew of a device's own clock
+    # plans per second that the arm's controller sends, each of the next second; 0: no stream plan
+    plan_rate_hz: Annotated[NonNegativeFloat, Unit("Hz")] = added(0.0)
 
 
 def _rig_options(params: Params | MaterialParams | TouchParams | GelParams) -> dict[str, Any]:
@@ -67,7 +70,8 @@ def _rig_options(params: Params | MaterialParams | TouchParams | GelParams) -> d
 def forward(params: Params, trial: Trial) -> RecordingOutput:
     """Simulate grasp-lift-move trials, with ground truth.
 
-    Each recording has the streams xela1, xela2, robot, proximity and, with ground truth, truth.
+    Each recording has the streams xela1, xela2, robot, proximity and, with ground truth, truth. With --plan-rate-hz, it
+    also has the stream plan.
 
     Example: tacpipe simulate forward --trials 12 --duration-s 6 -o data/recordings
     """

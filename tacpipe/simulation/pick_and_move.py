@@ -29,6 +29,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import Attribute, RecordingOutput
+from tacpipe.sensors import plan
 from tacpipe.simulation import faults, mechanics, taxels, trajectory
 
 # The proximity sensor at the wrist measures the distance to the object's top face, which increases with slip. Rest level,
@@ -58,6 +59,7 @@ OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
 MEMORY_BYTES = 1 << 24  # size of streams above which they move to disk
+PLAN_S, PLAN_POINT_S = 1.0, 0.02  # length of a plan, and the time between its points
 LOSS_S, SLIDE_S = 0.02, 0.04  # duration of a loss of grip, and of the overload after it
 
 
@@ -86,6 +88,7 @@ class PickRig:
     robot_jitter_ms: float = 0.5
     clock_offset_ms: float = 80.0
     clock_skew_ppm: float = 50.0
+    plan_rate_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ class PickScene:
 
 def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> RecordingOutput:
     """Simulate trial ``index`` of the rig, with the streams xela1, xela2, robot, proximity and truth.
+
+    With a ``plan_rate_hz``, there is also a stream plan.
 
     The same seed, index and rig give the same values. Attributes that start with ``gt_`` and the columns of ``truth``, at
     1 kHz, are ground truth. Raises `TacpipeError` if the trial is too short for the lift.
@@ -134,6 +139,8 @@ def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> Recording
 
         streams[name] = _build_in_blocks(len(samples.seq), build_rows, spill)
         labels |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
+    if rig.plan_rate_hz:
+        streams["plan"] = plans(scene, start_ns, rig.plan_rate_hz)
     streams["truth"] = _build_in_blocks(len(scene.path.t_ns), _truth(scene, start_ns), spill)
     return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | labels)
 
@@ -283,6 +290,21 @@ def arm(scene: PickScene, true_ns: Times) -> Floats:
     half = at(scene.path.yaw_rad) / 2
     zero = np.zeros_like(half)
     return np.column_stack([at(scene.finger_m), at(scene.path.position_m), np.cos(half), np.sin(half), zero, zero])
+
+
+def plans(scene: PickScene, start_ns: int, rate_hz: float) -> pa.Table:
+    """Return the plans that a controller sends at a rate, each of the next `PLAN_S`, up to the end of the trial."""
+    sent_ns = np.arange(0, int(scene.path.t_ns[-1]), round(1e9 / rate_hz), dtype=np.int64)
+    target_ns = sent_ns[:, None] + plan_points_ns()
+    exists = target_ns <= scene.path.t_ns[-1]
+    arrived_ns, target_ns = np.broadcast_to(sent_ns[:, None], exists.shape)[exists], target_ns[exists]
+    columns = [start_ns + target_ns, *arm(scene, target_ns)[:, 1:].T]
+    return schema.stream(start_ns + arrived_ns, columns, plan.Plan().fields())
+
+
+def plan_points_ns() -> Times:
+    """Return the times of the points of a plan after it is sent (point,)."""
+    return np.arange(0, round(PLAN_S * 1e9) + 1, round(PLAN_POINT_S * 1e9), dtype=np.int64)
 
 
 def _clock_fields() -> list[Any]:

@@ -15,7 +15,16 @@ from tacpipe.signals.contact import rest_level
 from tacpipe.signals.repairs import repeated_rows
 from tacpipe.simulation import taxels
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
-from tacpipe.simulation.pick_and_move import MASSES_KG, PickRig, PickScene, perform, simulate_trial, touch
+from tacpipe.simulation.pick_and_move import (
+    MASSES_KG,
+    START_NS,
+    TRIAL_NS,
+    PickRig,
+    PickScene,
+    perform,
+    simulate_trial,
+    touch,
+)
 from tests.fake_recordings import column
 
 CLEAN = PickRig(
@@ -265,6 +274,23 @@ def test_without_faults_the_arm_is_where_the_truth_has_it() -> None:
     assert len(height) == 12_000
     acceleration = column(recording.streams["truth"], "gt_acceleration_z_m_s2")
     np.testing.assert_allclose(height[-1] - height[0], np.cumsum(np.cumsum(acceleration))[-1] / 1e6, atol=5e-4)
+
+
+def test_plans_announce_where_the_hand_will_be_and_change_no_other_stream() -> None:
+    without, planned = (simulate_trial(3, 1, PickRig(duration_s=5.0, plan_rate_hz=rate_hz)) for rate_hz in (0.0, 10.0))
+    assert set(planned.streams) == {*without.streams, "plan"}
+    for name, stream in without.streams.items():
+        assert stream.equals(planned.streams[name]), name
+    plans = planned.streams["plan"].to_pandas()
+    start_ns = START_NS + TRIAL_NS
+    path = perform(3, 1, PickRig(duration_s=5.0)).path
+    rows = ((plans["t_target_ns"] - start_ns) // 1_000_000).to_numpy()
+    positions = plans[[f"position_{axis}_m" for axis in "xyz"]].to_numpy()
+    np.testing.assert_allclose(positions, path.position_m[rows], atol=1e-9)
+    ahead_ns = plans["t_target_ns"] - plans["t_ns"]
+    assert ahead_ns.min() == 0
+    assert ahead_ns.max() == 1_000_000_000
+    assert plans["t_ns"].nunique() == 50
 
 
 def test_ground_truth_is_marked_as_such() -> None:
