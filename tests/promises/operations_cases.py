@@ -238,9 +238,10 @@ def _publish(name: str, place: Path) -> None:
 
 
 HELD = (
-    "simulate forward --trials 4 --duration-s 5 --seed 7 --effort 1.15 --robot-rate-hz 50 -o data/r",
+    "simulate forward --trials 3 --duration-s 5 --seed 7 --effort 1.15 --tactile-rate-hz 12 --robot-rate-hz 50 "
+    "-o data/r",
     "label data/r trial-* --label slip=true",
-    "split data/r -o data/split --scheme random --val 0.25 --test 0",
+    "split data/r -o data/split --scheme random --val 0.34 --test 0",
 )
 GELS = (
     "simulate gel --trials 3 --duration-s 4 -o data/g",
@@ -275,14 +276,14 @@ STAGES = (
     Case("segment.losses", "segment losses data/r -o data/losses --streams xela*", HELD[:2]),
     Case(
         "train.slip",
-        "train slip data/r --split data/split --streams xela* -o models/s --trees 3 --leaf 5 --no-match-time",
+        "train slip data/r --split data/split --streams xela* -o models/s --trees 2 --leaf 5 --no-match-time",
         HELD,
     ),
     Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
     Case(
         "compress.autoencoder",
         "compress autoencoder data/c --split data/split -o data/z --epochs 1 --components 2 --hidden 4",
-        FORWARD[:4],
+        (*FORWARD[:3], "split data/c -o data/split --scheme random --val 0.25 --test 0.25"),
     ),
     Case("calibrate", "calibrate models/f data/c --split data/split -o models/g", FORWARD[:5]),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
