@@ -20,7 +20,7 @@ from tacpipe.tasks import recordings as recordings_of
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.slip.calibration import SlipCalibration
 from tacpipe.tasks.slip.params import SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer
+from tacpipe.tasks.slip.scorers import Scorer, load_baseline
 from tacpipe.tasks.slip.training import BASELINES, MODEL, labelled_tracks, score_windows, scored_tracks
 from tacpipe.tasks.slip.windows import Finger, FingerReader, GraspTrack, read_windows
 
@@ -122,7 +122,7 @@ def _load_baselines(files: Mapping[str, bytes], reader: FingerReader) -> dict[st
     baselines: dict[str, Scorer] = {}
     for name, own_config in described.items():
         own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
-        baselines[name] = BoostedScorer.load(own, own_config, reader)
+        baselines[name] = load_baseline(name, own, own_config, reader)
     return baselines
 
 

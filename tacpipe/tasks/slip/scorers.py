@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -15,6 +16,10 @@ from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
 
 if TYPE_CHECKING:
     from tacpipe.tasks.slip.params import Boosting
+
+LINEAR = "linear"  # name of the linear baseline
+PENALTY = 0.01  # L2 penalty on the weights of the linear baseline, relative to the mean error of a window
+LARGEST = 10.0  # largest standardised feature that the linear baseline reads
 
 
 class Scorer(Protocol):
@@ -47,12 +52,43 @@ class Scorer(Protocol):
 
 
 @dataclass(frozen=True)
-class BoostedScorer:
+class FeatureScorer(ABC):
+    """A scorer that reads some columns of the features."""
+
+    columns: tuple[int, ...]  # columns of the features with the time behind them
+
+    @property
+    def runs_live(self) -> bool:
+        """True, because features need no other window."""
+        return True
+
+    @abstractmethod
+    def score_features(self, features: Floats) -> Floats:
+        """Return scores (row,) of features (row, feature) with the time behind them."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, AnyArray]:
+        """Return the arrays of the model's file."""
+
+    def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
+        """Return the scores of rows of a track (row,)."""
+        return self.score_features(reader.features(track, rows))
+
+    def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
+        """Return the score of one window (time, channel) of each finger."""
+        features = reader.window_features([window[None] for window in windows])
+        return float(self.score_features(features)[0])
+
+    def describe(self) -> dict[str, object]:
+        """Return the columns that are read."""
+        return {"columns": list(self.columns)}
+
+
+@dataclass(frozen=True)
+class BoostedScorer(FeatureScorer):
     """Boosted trees on some columns of the features."""
 
     trees: BoostedTrees
-    columns: tuple[int, ...]  # columns of the features with the time behind them
-    runs_live: bool = True
 
     @classmethod
     def fitted(cls, windows: TrainingWindows, params: Boosting, columns: Sequence[int] | None = None) -> BoostedScorer:
@@ -60,8 +96,7 @@ class BoostedScorer:
 
         Columns without two different values are left out.
         """
-        allowed = range(windows.features.shape[1] - 1) if columns is None else columns
-        chosen = tuple(column for column in allowed if _varies(windows.features[:, column]))
+        chosen = _varying_columns(windows, columns)
         trees = BoostedTrees.fitted(
             windows.features[:, chosen],
             windows.slips,
@@ -73,37 +108,85 @@ class BoostedScorer:
             l2=params.l2,
             seed=params.seed,
         )
-        return cls(trees, chosen)
-
-    def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
-        """Return the scores of rows of a track (row,)."""
-        return self.score_features(reader.features(track, rows))
+        return cls(chosen, trees)
 
     def score_features(self, features: Floats) -> Floats:
         """Return scores (row,) of features (row, feature) with the time behind them."""
         return self.trees.scores(features[:, self.columns])
 
-    def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
-        """Return the score of one window (time, channel) of each finger."""
-        features = reader.window_features([window[None] for window in windows])
-        return float(self.trees.scores(features[:, self.columns])[0])
-
     def arrays(self) -> dict[str, AnyArray]:
         """Return the arrays of the trees."""
         return self.trees.arrays()
 
-    def describe(self) -> dict[str, object]:
-        """Return the columns that the trees read."""
-        return {"columns": list(self.columns)}
-
     @classmethod
     def load(cls, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> BoostedScorer:
         """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another."""
-        columns = tuple(map(int, described["columns"]))
-        available = reader.feature_count + 1
-        if not all(0 <= column < available for column in columns):
-            raise ValueError(f"columns {columns} of {available} features")
-        return cls(BoostedTrees.from_arrays(arrays, len(columns)), columns)
+        columns = _stored_columns(described, reader)
+        return cls(columns, BoostedTrees.from_arrays(arrays, len(columns)))
+
+
+@dataclass(frozen=True)
+class LinearScorer(FeatureScorer):
+    """Logistic regression on standardised features."""
+
+    means: Floats  # (column,)
+    deviations: Floats  # (column,)
+    weights: Floats  # (column,)
+    base: Floats  # (1,), the log odds of a window of mean features
+
+    @classmethod
+    def fitted(cls, windows: TrainingWindows) -> LinearScorer:
+        """Return a scorer trained on all features but the time. Missing features count as their mean."""
+        from sklearn.linear_model import LogisticRegression
+
+        columns = _varying_columns(windows)
+        counted = windows.weights > 0
+        rows = windows.features[counted][:, columns]
+        means, deviations = np.nanmean(rows, axis=0), np.maximum(np.nanstd(rows, axis=0), 1e-12)
+        weights = windows.weights[counted]
+        model = LogisticRegression(C=1 / (PENALTY * weights.sum()), max_iter=1000)
+        model.fit(_standardise(rows, means, deviations), windows.slips[counted], sample_weight=weights)
+        return cls(columns, means, deviations, model.coef_[0].astype(np.float64), model.intercept_.astype(np.float64))
+
+    def score_features(self, features: Floats) -> Floats:
+        """Return the log odds (row,) of features (row, feature) with the time behind them."""
+        rows = _standardise(features[:, self.columns], self.means, self.deviations)
+        scores: Floats = (rows * self.weights).sum(axis=1) + self.base[0]
+        return scores
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """Return the arrays of the regression."""
+        return {name: getattr(self, name) for name in ("means", "deviations", "weights", "base")}
+
+    @classmethod
+    def load(cls, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> LinearScorer:
+        """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another."""
+        columns = _stored_columns(described, reader)
+        parts = {name: np.asarray(arrays[name], np.float64) for name in ("means", "deviations", "weights", "base")}
+        shapes = {name: part.shape for name, part in parts.items()}
+        if set(shapes.values()) - {(len(columns),)} - {(1,)} or shapes["base"] != (1,):
+            raise ValueError(f"a regression of {shapes} for {len(columns)} columns")
+        return cls(columns, **parts)
+
+
+def _standardise(rows: Floats, means: Floats, deviations: Floats) -> Floats:
+    """Return features (row, column) in standard deviations from their means, limited, 0 where they are missing."""
+    standard = np.ascontiguousarray((rows - means) / deviations)
+    return np.nan_to_num(np.clip(standard, -LARGEST, LARGEST))
+
+
+def _stored_columns(described: Mapping[str, Any], reader: FingerReader) -> tuple[int, ...]:
+    columns = tuple(map(int, described["columns"]))
+    available = reader.feature_count + 1
+    if not all(0 <= column < available for column in columns):
+        raise ValueError(f"columns {columns} of {available} features")
+    return columns
+
+
+def _varying_columns(windows: TrainingWindows, columns: Sequence[int] | None = None) -> tuple[int, ...]:
+    """Return the columns, by default all but the time, that have two different values."""
+    allowed = range(windows.features.shape[1] - 1) if columns is None else columns
+    return tuple(column for column in allowed if _varies(windows.features[:, column]))
 
 
 def _varies(values: Floats) -> bool:
@@ -111,8 +194,31 @@ def _varies(values: Floats) -> bool:
     return bool(len(finite)) and bool(finite.min() < finite.max())
 
 
+BaselineFit = Callable[[TrainingWindows, str], FeatureScorer]  # windows and the name of a part of them -> baseline
+
+
+def baseline_fits(reader: FingerReader, sizes: Boosting) -> dict[str, BaselineFit]:
+    """Return the function that trains each baseline: trees of these sizes on few columns, and a linear model of all."""
+
+    def boost(columns: Sequence[int]) -> BaselineFit:
+        return lambda windows, name: BoostedScorer.fitted(windows, sizes, columns)
+
+    fits = {name: boost(columns) for name, columns in baseline_columns(reader).items()}
+    return {**fits, LINEAR: lambda windows, name: LinearScorer.fitted(windows)}
+
+
+def load_baseline(
+    name: str, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader
+) -> FeatureScorer:
+    """Return a stored baseline. Raises `ValueError` if its parts do not fit one another."""
+    kind = LinearScorer if name == LINEAR else BoostedScorer
+    return kind.load(arrays, described, reader)
+
+
 def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
-    """Return the columns that each baseline reads: the time, shear over load or else the level, and the total change.
+    """Return the columns that each baseline of boosted trees reads.
+
+    They are the time, shear over load or else the level, and the total change.
 
     Windows of one row have no such features, so only the time remains.
     """

@@ -55,7 +55,7 @@ class SlipTask(Task):
     name = "slip"
 
     @staticmethod
-    @stage(version=1, requirements=REQUIREMENTS, reads=("object", "slip_intervals"))
+    @stage(version=2, requirements=REQUIREMENTS, reads=("object", "slip_intervals"))
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 

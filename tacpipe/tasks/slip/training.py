@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.tasks import recordings
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
 from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule, SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, baseline_columns
+from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, baseline_fits
 from tacpipe.tasks.slip.windows import (
     FingerReader,
     GraspTrack,
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
 
 TASK = "slip"
 MODEL, BASELINES = "scorer.safetensors", "baselines.safetensors"
+BASELINE = Boosting(trees=60, leaves=6)  # size of the baselines that read few columns
 FOLDS = 5  # folds of out-of-fold scores
-BASELINE = Boosting(trees=60, leaves=6)  # size of the baselines, which read few columns
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,7 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
     held_out = labelled_tracks(reader, validation) if validation is not None else []
     calibration = calibrate_scorer(scorer, _fit_params(params, workspace), windows, held_out)
     baselines, levels = {}, {}
-    for name, columns in baseline_columns(reader).items():
-        fit = functools.partial(_fit_baseline, columns=columns)
+    for name, fit in baseline_fits(reader, BASELINE).items():
         baselines[name] = fit(windows, "")
         levels[name] = calibrate_scorer(baselines[name], fit, windows, held_out).to_config()["levels"]
     counts = {
@@ -194,10 +192,6 @@ def out_of_fold(windows: TrainingWindows, fit: Fit) -> Floats:
 
 def _fit_params(params: SlipModelParams, workspace: Path) -> Fit:
     return lambda part, name: params.fit(SlipTraining(part, workspace / name))
-
-
-def _fit_baseline(windows: TrainingWindows, name: str, columns: Sequence[int]) -> BoostedScorer:
-    return BoostedScorer.fitted(windows, BASELINE, columns)
 
 
 def _require_both(windows: TrainingWindows, recordings_read: int, labelled: int) -> None:

@@ -48,7 +48,9 @@ def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[An
     assert pooled["counts"]["recordings"] == 12
     assert pooled["counts"]["slips"] == 6
     areas = area_table(pooled)
-    assert list(areas.heads) == ["windows", "model", "shear over load", "time only", "total change", "constant"]
+    assert list(areas.heads) == [
+        *("windows", "model", "linear", "shear over load", "time only", "total change", "constant")
+    ]
     alarms = alarm_table(pooled)
     assert len(alarms.rows) == 3
     assert all(len(row.cells) == len(ALARM_HEADS) + 1 for row in alarms.rows)

@@ -10,7 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
+from sklearn.preprocessing import StandardScaler
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.slip import calibration, metrics
@@ -19,7 +21,17 @@ from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
 from tacpipe.tasks.slip.features import FingerLayout, finger_features
 from tacpipe.tasks.slip.labels import read_labels
 from tacpipe.tasks.slip.params import Boosting
-from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE, UNCOUNTED, match_time, read_training, shuffle_labels
+from tacpipe.tasks.slip.scorers import LinearScorer
+from tacpipe.tasks.slip.windows import (
+    BEFORE,
+    DURING,
+    STABLE,
+    UNCOUNTED,
+    match_time,
+    read_training,
+    read_windows,
+    shuffle_labels,
+)
 from tests.fake_recordings import FakeRecording, dataset
 from tests.tasks.slip.slip_recordings import held_object, trials
 
@@ -66,6 +78,23 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
     assert trees.scores(rows) == pytest.approx(oracle.decision_function(rows), abs=1e-9)
     loaded = BoostedTrees.from_arrays(trees.arrays(), 5)
     assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
+
+
+def test_the_linear_baseline_scores_as_the_regression_of_scikit_learn_does() -> None:
+    reader, tracks = read_training(dataset(*trials(8)), Boosting())
+    windows = read_windows(reader, tracks, Boosting(), stride=5)
+    scorer = LinearScorer.fitted(windows)
+    columns, counted = list(scorer.columns), windows.weights > 0
+    rows = windows.features[:, columns]
+    scaler = StandardScaler().fit(rows[counted])
+    oracle = LogisticRegression(C=1 / (0.01 * windows.weights.sum()), max_iter=1000)
+    oracle.fit(scaler.transform(rows[counted]).clip(-10, 10), windows.slips[counted], windows.weights[counted])
+    scores = scorer.score_features(windows.features)
+    assert scores == pytest.approx(oracle.decision_function(scaler.transform(rows).clip(-10, 10)), abs=1e-3)
+    loaded = LinearScorer.load(scorer.arrays(), scorer.describe(), reader)
+    assert loaded.score_features(windows.features[3:4]).tobytes() == scores[3:4].tobytes()
+    with pytest.raises(ValueError, match="columns"):
+        LinearScorer.load({**scorer.arrays(), "weights": np.zeros(2)}, scorer.describe(), reader)
 
 
 def test_trees_whose_nodes_lead_back_are_refused() -> None:
