@@ -14,6 +14,8 @@ import numpy as np
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Int32s
 
 LEAF = -1  # the child of a node without children
+BINS = 255  # bins of a feature
+SAMPLED_ROWS = 200_000  # rows above which scikit-learn bins a sample of them, without weights
 
 
 @dataclass(frozen=True)
@@ -59,18 +61,23 @@ class BoostedTrees:
             early_stopping=False,
             random_state=seed,
         )
-        model.fit(rows, labels, sample_weight=weights)
+        edges = [bin_edges(column, weights) for column in rows.T] if len(rows) <= SAMPLED_ROWS else []
+        model.fit(_bin_rows(rows, edges) if edges else rows, labels, sample_weight=weights)
         grown = [stage[0].nodes for stage in model._predictors]
         starts = np.cumsum([0, *map(len, grown)])[:-1]
         nodes = np.concatenate(grown)
         offsets = np.repeat(starts, [len(tree) for tree in grown])
         is_leaf = nodes["is_leaf"].astype(bool)
+        cuts = nodes["num_threshold"].copy()
+        for feature, values in enumerate(edges):
+            chosen = (nodes["feature_idx"] == feature) & ~is_leaf & np.isfinite(cuts)
+            cuts[chosen] = values[np.ceil(cuts[chosen]).astype(np.intp) - 1]  # a cut is between two numbers of bins
         pairs = np.column_stack([nodes["left"], nodes["right"]]).astype(np.int64) + offsets[:, None]
         return cls(
             starts.astype(np.int32),
             np.where(is_leaf[:, None], LEAF, pairs).astype(np.int32),
             np.where(is_leaf, 0, nodes["feature_idx"]).astype(np.int32),
-            np.where(is_leaf, 0.0, np.minimum(nodes["num_threshold"], np.finfo(np.float64).max)),
+            np.where(is_leaf, 0.0, np.minimum(cuts, np.finfo(np.float64).max)),
             nodes["missing_go_to_left"].astype(np.int32),
             nodes["value"].astype(np.float64),
             np.ravel(model._baseline_prediction).astype(np.float64)[:1],
@@ -128,3 +135,32 @@ class BoostedTrees:
         if wrong:
             raise ValueError(f"the {wrong} of boosted trees of {nodes} nodes are out of range")
         return trees
+
+
+def bin_edges(values: AnyFloats, weights: AnyFloats) -> Floats:
+    """Return the ascending upper edges of all bins of a feature but the last, of values (row,) with weights (row,).
+
+    Bins have about equal weight. The edges are those of scikit-learn, which sorts all rows again for each edge.
+    """
+    counted = ~np.isnan(values) & (weights != 0)
+    order = np.argsort(values[counted])
+    ordered, mass = values[counted][order], weights[counted][order]
+    distinct = np.unique(ordered)
+    if len(distinct) <= BINS:
+        return np.asarray((distinct[:-1] + distinct[1:]) / 2)
+    total = np.cumsum(mass)
+    targets = np.linspace(0, 100, BINS + 1)[1:-1] / 100 * total[-1]
+    last = len(ordered) - 1
+    places = np.minimum(np.searchsorted(total, targets), last)
+    between = (ordered[places] + ordered[np.minimum(places + 1, last)]) / 2
+    edges = np.unique(np.where(total[places] - targets > np.finfo(np.float64).eps, ordered[places], between))
+    return np.asarray(np.minimum(edges, np.finfo(np.float64).max))
+
+
+def _bin_rows(rows: AnyFloats, edges: list[Floats]) -> Floats:
+    """Return the number of the bin of each value (row, feature); NaN stays."""
+    numbers = np.empty(rows.shape)
+    for feature, values in enumerate(edges):
+        column = rows[:, feature]
+        numbers[:, feature] = np.where(np.isnan(column), np.nan, np.searchsorted(values, column))
+    return numbers

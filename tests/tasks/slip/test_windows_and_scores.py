@@ -69,12 +69,12 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
     rows = rng.normal(size=(600, 5))
     labels = rows[:, 0] * rows[:, 1] > 0.3
     rows[rng.random(rows.shape) < missing] = np.nan
+    rows[:, 1] = rows[:, 1].round(1)
+    weights = np.where(rng.random(600) < missing, 0.0, 3 * rng.random(600))
     sizes = {"learning_rate": 0.2, "max_leaf_nodes": 8, "min_samples_leaf": 5, "l2_regularization": 1.0}
     oracle = HistGradientBoostingClassifier(max_iter=20, early_stopping=False, random_state=3, **sizes)
-    oracle.fit(rows, labels, sample_weight=np.ones(600))
-    trees = BoostedTrees.fitted(
-        rows, labels, np.ones(600), trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3
-    )
+    oracle.fit(rows, labels, sample_weight=weights)
+    trees = BoostedTrees.fitted(rows, labels, weights, trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3)
     assert trees.scores(rows) == pytest.approx(oracle.decision_function(rows), abs=1e-9)
     loaded = BoostedTrees.from_arrays(trees.arrays(), 5)
     assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
