@@ -63,7 +63,7 @@ class SlipModel:
             fingers = tuple(Finger.from_config(finger) for finger in config["fingers"])
             if not fingers:
                 raise ValueError("the model reads no finger")
-            reader = FingerReader(fingers, round(params.rest_s * 1e9))
+            reader = FingerReader(fingers, round(params.rest_s * 1e9), params.reads_plans)
             arrays = model_files.arrays(files[MODEL], MODEL)
             scorer = params.load_scorer(arrays, config["scorer"], reader)
             baselines = _load_baselines(files, reader)

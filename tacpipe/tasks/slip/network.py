@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Indices
 from tacpipe.errors import TacpipeError
+from tacpipe.tasks.slip.planned import CHANNELS
 from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
 from tacpipe.training import loop
 from tacpipe.training.following import Line, Validated
@@ -53,10 +54,23 @@ class CausalNetwork(nn.Module):
         return scores[:, 0]
 
 
-def stack_fingers(windows: Sequence[AnyFloats]) -> Float32s:
-    """Return windows (window, time, channel) of several fingers as (window, channel, time), those of all fingers."""
-    joined = np.concatenate([np.clip(part, -LIMIT, LIMIT) for part in windows], axis=2)
+def stack_windows(windows: Sequence[AnyFloats], reader: FingerReader) -> Float32s:
+    """Return `FingerReader.windows` as (window, channel, time): the channels of all fingers, then those of the plan.
+
+    The plan has as many rows as a finger, at equal intervals from the current row to the end of its second. It is 0 where
+    it is unknown.
+    """
+    parts = list(windows)
+    if reader.reads_plans:
+        rows = reader.fingers[0].rows
+        parts[-1] = np.nan_to_num(parts[-1][:, np.linspace(0, parts[-1].shape[1] - 1, rows).astype(np.intp)])
+    joined = np.concatenate([np.clip(part, -LIMIT, LIMIT) for part in parts], axis=2)
     return np.ascontiguousarray(joined.transpose(0, 2, 1), np.float32)
+
+
+def input_count(reader: FingerReader) -> int:
+    """Return the number of channels of `stack_windows`."""
+    return sum(len(finger.channels) for finger in reader.fingers) + len(CHANNELS) * reader.reads_plans
 
 
 class WindowWork:
@@ -78,17 +92,14 @@ class WindowWork:
         for number in np.unique(windows.track[chosen]).tolist():
             places = np.flatnonzero(windows.track[chosen] == number)
             rows = windows.rows[chosen[places]]
-            track = windows.tracks[number]
-            parts[places] = stack_fingers(
-                [track.windows(rows, index, finger.rows) for index, finger in enumerate(windows.reader.fingers)]
-            )
+            parts[places] = stack_windows(windows.reader.windows(windows.tracks[number], rows), windows.reader)
         return torch.from_numpy(parts)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Channels and rows of a window."""
-        fingers = self.windows.reader.fingers
-        return sum(len(finger.channels) for finger in fingers), fingers[0].rows
+        reader = self.windows.reader
+        return input_count(reader), reader.fingers[0].rows
 
     def batches(self, epoch: int) -> list[Tensor]:
         """Return shuffled batches of indices of the training windows."""
@@ -149,9 +160,7 @@ class ConvolutionScorer:
         """Return the scores of rows of a track (row,), one window at a time."""
         scores = np.empty(len(rows))
         for index, row in enumerate(rows):
-            windows = [
-                track.windows(np.array([row]), number, finger.rows)[0] for number, finger in enumerate(reader.fingers)
-            ]
+            windows = [part[0] for part in reader.windows(track, np.array([row]))]
             scores[index] = self.score_window(reader, windows)
         return scores
 
@@ -160,9 +169,9 @@ class ConvolutionScorer:
         return
 
     def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
-        """Return the score of one window (time, channel) of each finger."""
+        """Return the score of one window of `FingerReader.windows`, each (time, channel)."""
         with torch.no_grad():
-            return float(self.network(torch.from_numpy(stack_fingers([window[None] for window in windows])))[0])
+            return float(self.network(torch.from_numpy(stack_windows([window[None] for window in windows], reader)))[0])
 
     def arrays(self) -> dict[str, AnyArray]:
         """Return the weights."""
@@ -179,7 +188,7 @@ class ConvolutionScorer:
         """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another."""
         _require_equal_rows(reader)
         sizes = {name: int(described[name]) for name in ("inputs", "channels", "layers")}
-        inputs = sum(len(finger.channels) for finger in reader.fingers)
+        inputs = input_count(reader)
         if sizes["inputs"] != inputs or not (0 < sizes["channels"] <= MAX_WIDTH and 0 < sizes["layers"] <= 8):
             raise ValueError(f"a network of {sizes} for {inputs} channels")
         network = CausalNetwork(**sizes)

@@ -17,7 +17,7 @@ from tacpipe.plugins.constraints import (
     Seed,
     Unit,
 )
-from tacpipe.plugins.params import Panels
+from tacpipe.plugins.params import Panels, added
 from tacpipe.tasks.task import ModelConfig
 
 if TYPE_CHECKING:
@@ -49,6 +49,8 @@ class SlipModelParams(ABC):
     match_time: bool = True
     # slips of each training recording: its own, or shuffled over recordings, to show what a wrong label would score
     labels: Literal["own", "shuffled"] = "own"
+    # planned: read the plans in the stream plan, from their arrival on; none: read touch only
+    actions: Literal["none", "planned"] = added("none")
     seed: Seed = 0  # random seed
     PANELS: ClassVar[Panels] = {
         "Model": (
@@ -56,8 +58,13 @@ class SlipModelParams(ABC):
             *("channels", "layers", "forward_model"),
         ),
         "Training": ("stride", "match_time", "labels", "epochs", "batch", "patience", "weight_decay", "seed"),
-        "Data": ("streams", "rest_s", "recovery_s"),
+        "Data": ("streams", "actions", "rest_s", "recovery_s"),
     }
+
+    @property
+    def reads_plans(self) -> bool:
+        """Whether the model reads planned motion."""
+        return self.actions == "planned"
 
     @abstractmethod
     def fit(self, training: SlipTraining) -> Scorer:

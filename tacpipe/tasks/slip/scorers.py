@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
 from tacpipe.tasks.slip.boosting import BoostedTrees
-from tacpipe.tasks.slip.features import feature_names
+from tacpipe.tasks.slip.planned import NAMES_OF_PLAN
 from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Scorer(Protocol):
         ...
 
     def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
-        """Return the score of one window (time, channel) of each finger, the same bits as `score`."""
+        """Return the score of one window of `FingerReader.windows`, each (time, channel); the same bits as `score`."""
         ...
 
     def arrays(self) -> dict[str, AnyArray]:
@@ -75,7 +75,7 @@ class FeatureScorer(ABC):
         return self.score_features(reader.features(track, rows))
 
     def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
-        """Return the score of one window (time, channel) of each finger."""
+        """Return the score of one window of `FingerReader.windows`, each (time, channel)."""
         features = reader.window_features([window[None] for window in windows])
         return float(self.score_features(features)[0])
 
@@ -218,22 +218,22 @@ def load_baseline(
 def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
     """Return the columns that each baseline of boosted trees reads.
 
-    They are the time, shear over load or else the level, and the total change.
+    They are the time, shear over load or else the level, the total change, and the plan.
 
-    Windows of one row have no such features, so only the time remains.
+    A baseline whose features do not exist is left out.
     """
-    names = feature_names(len(reader.fingers))
-    if reader.feature_count != len(names):
-        return {"time_only": (reader.feature_count,)}
+    names = reader.names
 
     def places(*words: str) -> tuple[int, ...]:
         return tuple(index for index, name in enumerate(names) if name.removeprefix("largest ") in words)
 
-    return {
+    baselines = {
         "time_only": (len(names),),
         "shear_over_load": places("shear over load", "shear", "level"),
         "total_change": places("motion"),
+        "planned_motion": places(*(name.removeprefix("largest ") for name in NAMES_OF_PLAN)),
     }
+    return {name: columns for name, columns in baselines.items() if columns}
 
 
 CONSTANT = "constant"

@@ -37,6 +37,14 @@ REQUIREMENTS = Requirements(
             "slip: 1 while the object slips; contact: negative while nothing is touched",
             "Without slip, the label slip_intervals replaces it. Without contact, all rows count as contact.",
         ),
+        Channels(
+            "plan",
+            ("m", "ns"),
+            "plans of the arm's controller: t_ns is the arrival, t_target_ns the planned time, position_x_m, position_y_m "
+            "and position_z_m (upwards) the planned position",
+            "Read with --actions planned, each plan from its arrival on. Measured positions are not read.",
+            stream="plan",
+        ),
     ),
     labels=(
         Label(
@@ -59,8 +67,8 @@ class SlipTask(Task):
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 
-        The model reads the last second of all tactile streams and returns the probability that the object slips within
-        the next second. Alarm levels are set on validation recordings.
+        The model reads the last second of all tactile streams, optionally also the planned motion, and returns the
+        probability that the object slips within the next second. Alarm levels are set on validation recordings.
 
         Example: tacpipe train slip data/slips --split data/split -o models/slip
         """

@@ -1,4 +1,4 @@
-"""Read recordings as windows of touch: for each row of the first finger, the last rows of every finger."""
+"""Read recordings as windows: for each row of the first finger, the last rows of every finger, and the plan ahead."""
 
 from __future__ import annotations
 
@@ -11,8 +11,17 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.slip.features import FingerLayout, combine_fingers, feature_names, finger_features
 from tacpipe.tasks.slip.labels import SlipLabels, read_labels
+from tacpipe.tasks.slip.planned import (
+    NAMES_OF_PLAN,
+    NAMES_WITH_TOUCH,
+    PlannedMotion,
+    planned_features,
+    predicted_ratios,
+    sample_ahead,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -137,6 +146,7 @@ class GraspTrack:
     ready: Bools  # (time,), whether all windows are full
     labels: SlipLabels | None
     recording: Recording | None = None  # as it was opened
+    plans: PlannedMotion | None = None  # None if the model reads none, or the recording has none
 
     @property
     def since_s(self) -> Floats:
@@ -185,6 +195,7 @@ class FingerReader:
 
     fingers: tuple[Finger, ...]
     rest_ns: int
+    reads_plans: bool = False
 
     def track(self, recording: Recording) -> GraspTrack:
         """Return a recording as a track. Raises `TacpipeError` if it lacks a stream or a channel."""
@@ -216,6 +227,7 @@ class FingerReader:
             ready,
             read_labels(recording),
             recording,
+            PlannedMotion.from_recording(recording) if self.reads_plans else None,
         )
 
     def table(self, recording: Recording, finger: Finger) -> pa.Table:
@@ -236,22 +248,45 @@ class FingerReader:
         return recording.table(stream, names)
 
     @property
-    def feature_count(self) -> int:
-        """The number of features: those of windows, or the channels if windows have one row."""
+    def names(self) -> list[str]:
+        """The names of the features: those of windows, or the channels if windows have one row; then those of plans."""
         if self._reads_rows:
-            return sum(len(finger.channels) for finger in self.fingers)
-        return len(feature_names(len(self.fingers)))
+            names = [f"{finger.stream} {channel}" for finger in self.fingers for channel in finger.channels]
+        else:
+            names = feature_names(len(self.fingers))
+        if self.reads_plans:
+            names += [*NAMES_OF_PLAN, *([] if self._reads_rows else NAMES_WITH_TOUCH)]
+        return names
+
+    @property
+    def feature_count(self) -> int:
+        """The number of features."""
+        return len(self.names)
 
     @property
     def _reads_rows(self) -> bool:
         return all(finger.rows == 1 for finger in self.fingers)
 
+    def windows(self, track: GraspTrack, rows: Indices) -> list[AnyFloats]:
+        """Return the windows that end in rows (window, time, channel): of each finger, and of the plan if it is read."""
+        windows = [track.windows(rows, index, finger.rows) for index, finger in enumerate(self.fingers)]
+        return [*windows, sample_ahead(track.plans, track.t_ns[rows])] if self.reads_plans else windows
+
     def window_features(self, windows: Sequence[AnyFloats]) -> Floats:
-        """Return the features (window, feature) of windows (window, time, channel) of each finger."""
+        """Return the features (window, feature) of `windows`."""
+        touch = windows[: len(self.fingers)]
         if self._reads_rows:
-            return np.concatenate([part[:, -1] for part in windows], axis=1)
-        by_finger = [finger_features(part, finger.places) for part, finger in zip(windows, self.fingers, strict=True)]
-        return combine_fingers(by_finger)
+            features: Floats = np.concatenate([part[:, -1] for part in touch], axis=1)
+        else:
+            features = combine_fingers(
+                [finger_features(part, finger.places) for part, finger in zip(touch, self.fingers, strict=True)]
+            )
+        if not self.reads_plans:
+            return features
+        planned = planned_features(windows[-1])
+        return np.concatenate(
+            [features, planned, *([] if self._reads_rows else [predicted_ratios(features, planned)])], axis=1
+        )
 
     def features(self, track: GraspTrack, rows: Indices) -> Floats:
         """Return the features of rows of a track (row, feature), with the time since the start behind them."""
@@ -259,8 +294,7 @@ class FingerReader:
         features = np.empty((len(rows), columns + 1))
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
-            windows = [track.windows(rows[block], index, finger.rows) for index, finger in enumerate(self.fingers)]
-            features[block, :columns] = self.window_features(windows)
+            features[block, :columns] = self.window_features(self.windows(track, rows[block]))
         features[:, columns] = track.since_s[rows]
         return features
 
@@ -295,9 +329,15 @@ def read_training(recordings: Dataset, params: SlipModelParams) -> tuple[FingerR
         _finger(stream, channels, layout, [streams[stream] for streams in raw.values()], params)
         for stream, (channels, layout) in sorted(schemas.items())
     )
-    reader = FingerReader(fingers, rest_ns)
+    reader = FingerReader(fingers, rest_ns, params.reads_plans)
     tracks = (reader.track_of(recordings.recordings[name], streams) for name, streams in raw.items())
-    return reader, [track for track in tracks if track.labels is not None]
+    labelled = [track for track in tracks if track.labels is not None]
+    if reader.reads_plans and labelled and not any(track.plans for track in labelled):
+        raise TacpipeError(
+            f"None of {len(labelled)} training recordings has a stream {PLAN} of planned motion. Record the plans of the "
+            f"controller, or train with --actions none."
+        )
+    return reader, labelled
 
 
 def _finger(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tacpipe.live import wire
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN
+from tacpipe.sensors import plan
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.tasks.slip import training
@@ -28,7 +30,7 @@ from tacpipe.tasks.slip.live.evaluation import SessionAlarms
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tacpipe.tasks.slip.live.task import SlipLive, SlipSettings
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.params import Boosting
+from tacpipe.tasks.slip.params import Boosting, ConvolutionParams
 from tests.fake_recordings import FakeRecording, dataset
 from tests.sensors import made
 
@@ -36,6 +38,33 @@ STREAMS = ("left", "right")
 PERIOD_NS, START_NS, OFFSET_NS, SETTLE_NS = 20_000_000, 10**12, 5 * 10**17, 2_000_000
 SMALL = Boosting(trees=10, leaves=4, leaf=5, learning_rate=0.3, window_s=0.4, horizon_s=0.4, rest_s=0.1)
 ROWS = 150
+NETWORK = ConvolutionParams(
+    channels=4, layers=2, epochs=1, window_s=0.4, horizon_s=0.4, rest_s=0.1, actions="planned", stride=2
+)
+
+
+def plan_packet(row: int) -> tuple[int, bytes]:
+    """Return when the plan that is sent after a row arrives, on the monotonic clock, and its packet.
+
+    The plan shakes the hand while a slip is near.
+    """
+    arrived_ns = START_NS + row * PERIOD_NS + 7_000_000
+    t_ns = arrived_ns + OFFSET_NS + np.arange(0, 500_000_000, 25_000_000)
+    poses = np.zeros((len(t_ns), 7))
+    size_m = 0.05 if 35 <= row < 70 or 85 <= row < 120 else 0.01
+    poses[:, 0], poses[:, 6] = size_m * np.sin(row + t_ns % 10**9 / 1e8), 1.0
+    return arrived_ns, plan.packet(t_ns.tolist(), poses)
+
+
+def plan_stream(packets: Mapping[int, tuple[int, bytes]]) -> pa.Table:
+    """Return the recorded stream of packets."""
+    sensor = plan.Plan()
+    samples = sensor.decode([packet for _, packet in packets.values()])
+    arrived = np.array([arrived_ns + OFFSET_NS for arrived_ns, _ in packets.values()])[samples.rows]
+    columns = [arrived, *np.hstack(samples.values).T]
+    schema = pa.schema([pa.field("t_ns", pa.int64()), *sensor.fields()])
+    columns[1] = samples.values[0][:, 0]
+    return pa.Table.from_arrays([pa.array(column) for column in columns], schema=schema)
 
 
 class Rig:
@@ -54,6 +83,8 @@ class Rig:
                 pa.array(column).cast(field.type) for column, field in zip(values.T, sensor.fields(), strict=True)
             ]
             streams[name] = pa.Table.from_arrays([pa.array(t_ns), *columns], schema=schema)
+        self.plans = {row: plan_packet(row) for row in range(10, ROWS, 15)}
+        streams["plan"] = plan_stream(self.plans)
         self.recording = FakeRecording(streams, "trial-0", {"slip_intervals": "1.2-1.4 2.2-2.4"})
 
     @staticmethod
@@ -73,10 +104,19 @@ def model(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> SlipModel:
     return SlipModel.load(files)
 
 
+@pytest.fixture(
+    scope="module", params=[dataclasses.replace(SMALL, actions="planned"), NETWORK], ids=["trees", "network"]
+)
+def planned_model(request: Any, rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> SlipModel:
+    files = training.train(request.param, dataset(rig.recording), None, tmp_path_factory.mktemp("workspace"))
+    return SlipModel.load(files)
+
+
 def engine_for(rig: Rig, model: SlipModel, level: float = 0.0) -> SlipEngine:
-    engine = SlipEngine(model, rig.sensors, SlipDescription("m", 50.0, 0.4, "1", {}), level, settle_ns=SETTLE_NS)
+    sensors = {**rig.sensors, **({"plan": plan.Plan()} if model.reader.reads_plans else {})}
+    engine = SlipEngine(model, sensors, SlipDescription("m", 50.0, 0.4, "1", {}), level, settle_ns=SETTLE_NS)
     engine.take("", StreamNote(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
-    for name in STREAMS:
+    for name in sensors:
         engine.take(name, StreamNote(START_NS, name, BEGAN))
     return engine
 
@@ -85,21 +125,48 @@ def published(rig: Rig, engine: SlipEngine, rows: int = ROWS, size: int = 1) -> 
     """Return the messages of a session whose samples arrive ``size`` at a time."""
     messages: list[SlipMessage] = []
     for first in range(0, rows, size):
+        chosen = range(first, min(first + size, rows))
         for name in STREAMS:
-            pairs = [(rig.at_ns(name, row), rig.packets[name][row]) for row in range(first, min(first + size, rows))]
-            engine.take(name, Chunks.from_pairs(pairs))
+            engine.take(name, Chunks.from_pairs([(rig.at_ns(name, row), rig.packets[name][row]) for row in chosen]))
+        if "plan" in engine.sensors and (pairs := [rig.plans[row] for row in chosen if row in rig.plans]):
+            engine.take("plan", Chunks.from_pairs(pairs))
         messages += engine.step(rig.at_ns("right", min(first + size, rows) - 1) + SETTLE_NS)
     return messages
 
 
 @pytest.mark.parametrize("size", [1, 3])
 def test_published_probabilities_are_those_of_the_recording_to_the_bit(rig: Rig, model: SlipModel, size: int) -> None:
+    assert_published(rig, model, size)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_probabilities_with_plans_are_those_of_the_recording_to_the_bit(
+    rig: Rig, planned_model: SlipModel, size: int
+) -> None:
+    scores = assert_published(rig, planned_model, size)
+    no_plans = dataclasses.replace(rig.recording, tables={name: rig.recording.tables[name] for name in STREAMS})
+    assert (planned_model.table(no_plans)["score"].to_numpy() != scores).any()
+
+
+def test_a_plan_that_arrives_after_its_probability_is_late(rig: Rig, planned_model: SlipModel) -> None:
+    engine = engine_for(rig, planned_model)
+    published(rig, engine, 60)
+    assert engine.late == 0
+    engine.take("plan", Chunks.from_pairs([rig.plans[40]]))
+    engine.step(rig.at_ns("right", 60) + SETTLE_NS)
+    assert engine.late == 1
+
+
+def assert_published(rig: Rig, model: SlipModel, size: int) -> np.ndarray:
+    """Compare the messages of a session with the table of its recording, and return the scores."""
     messages = [message for message in published(rig, engine_for(rig, model), size=size) if message.answers]
     table = model.table(rig.recording)
     assert [message.t_ns for message in messages] == table["t_ns"].to_pylist()
     for name in ("probability", "score"):
         sent = np.array([getattr(message, name) for message in messages])
         assert sent.tobytes() == table[name].to_numpy().tobytes()
+    scores: np.ndarray = table["score"].to_numpy()
+    return scores
 
 
 def test_an_alarm_is_on_from_its_level(rig: Rig, model: SlipModel) -> None:

@@ -1,7 +1,7 @@
 """Convert the blocks of a live session to probabilities of a slip, one per sample of the first finger.
 
-The engine keeps the last rows of each finger, and computes a probability as soon as all samples that arrived by then have
-been decoded. The values are those that `SlipModel.table` computes from the recording, to the bit.
+The engine keeps the last rows of each finger and the newest plan, and computes a probability as soon as all samples that
+arrived by then have been decoded. The values are those that `SlipModel.table` computes from the recording, to the bit.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON
+from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tacpipe.tasks.slip.model import SlipModel
+from tacpipe.tasks.slip.planned import PlannedMotion
 from tacpipe.tasks.slip.windows import Finger, fill_missing, measure_rest
 
 EVERY_NS = 1_000_000  # time between two looks at new samples
@@ -108,6 +110,7 @@ class SlipEngine(Engine):
         self._rest: Mapping[str, list[float]] = {}
         self._decoders: dict[str, Decoder] = {}
         self._columns: dict[str, tuple[int, ...]] = {}
+        self._plans = PlannedMotion()
         self._pending: deque[int] = deque()  # times of samples of the first finger without a probability
         self._read_ns = 0  # time of the newest probability
         self._heard_ns: int | None = None  # monotonic, of the latest message
@@ -135,8 +138,9 @@ class SlipEngine(Engine):
         self._rest = json.loads(beginning)["rest"]
 
     def begin_recording(self, offset_ns: int) -> None:
-        """Begin a recording."""
+        """Begin a recording; plans of the previous one are not in it."""
         self._decoders = {}
+        self._plans = PlannedMotion()
         self._restart(self._rest)
         self._rest = {}
         self._heard_ns = None
@@ -151,7 +155,7 @@ class SlipEngine(Engine):
 
     def begin_stream(self, stream: str) -> None:
         """Decode a stream from the start of the recording."""
-        if stream in self._fingers:
+        if stream in self._fingers or (stream == PLAN and self._model.reader.reads_plans):
             self._decoders[stream] = Decoder(self.sensors[stream])
 
     def take_note(self, stream: str, note: StreamNote) -> None:
@@ -161,7 +165,7 @@ class SlipEngine(Engine):
             self._decoders[stream].take(note)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Store bytes of a finger."""
+        """Store bytes of a finger or of plans."""
         if stream in self._decoders:
             self._decoders[stream].take(chunks)
 
@@ -203,6 +207,9 @@ class SlipEngine(Engine):
         for name, decoder in self._decoders.items():
             for batch in decoder.batches():
                 columns = decoder.columns(batch, offset_ns)
+                if name == PLAN:
+                    self._late += int((self._plans.push(columns) <= self._read_ns).sum())
+                    continue
                 if name not in self._columns:
                     names = self._fingers[name].finger.channels
                     self._columns[name] = tuple(columns.schema.get_field_index(channel) for channel in names)
@@ -223,7 +230,9 @@ class SlipEngine(Engine):
             return SlipMessage(self.next_seq(), t_ns, cause=cause)
         self._why = ""
         full = [window for window in windows if window is not None]
-        score = self._model.scorer.score_window(self._model.reader, full)
+        ahead = [self._plans.ahead(t_ns)] if self._model.reader.reads_plans else []
+        self._plans.forget_before(t_ns)
+        score = self._model.scorer.score_window(self._model.reader, [*full, *ahead])
         probability = float(self._model.calibration.probability(np.array([score]))[0])
         newest = [int(so_far.t_ns[so_far.newest_row(t_ns)]) for so_far in self._fingers.values()]
         state = ON if score >= self._level else OFF

@@ -10,11 +10,13 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
 from tacpipe.printable import listed
+from tacpipe.sensors.plan import MEASURED
+from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.slip.live.messages import DECLARATION, SLIP
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.plugins.stage import Result
+    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Sensor
@@ -28,6 +30,9 @@ class SlipSettings(TaskSettings):
 
     # False alarms per minute that the alarm was set for: 0.1, 1 or 10 [1]
     alarms_per_minute: Annotated[float, Range(above=0, maximum=60)] = 1.0
+    # Source of plans: measured (none, the default), udp::PORT or ws:HOST:PORT
+    plan: str = MEASURED
+    plan_from: str = ""  # IP address whose plans are accepted, for --plan udp:HOST:PORT
 
 
 class SlipLive(LiveTask):
@@ -40,12 +45,15 @@ class SlipLive(LiveTask):
         """Return the streams of probabilities and latencies.
 
         Raises `TacpipeError` if the model was trained behind a stage, or does not run live; `UsageError` if the rig lacks a
-        stream of the model or the model an alarm.
+        stream of the model, the model an alarm, or a model that reads plans a source of them.
         """
         from tacpipe.datasets import model_files
+        from tacpipe.live import plans
 
         own = _own(settings)
-        config = model_files.tree(model.files, model_files.CONFIG, {"fingers": list, "calibration.levels": dict})
+        config = model_files.tree(
+            model.files, model_files.CONFIG, {"fingers": list, "calibration.levels": dict, "params": dict}
+        )
         _require_recorded(model)
         _level_name(config["calibration"]["levels"], own.alarms_per_minute)
         for finger in config["fingers"]:
@@ -61,7 +69,15 @@ class SlipLive(LiveTask):
                     f"The stream {finger['stream']} of this rig has no channel {missing[0]}, which the model reads. Take "
                     f"the rig that the model was trained on."
                 )
-        return SessionPlan(rig, own, {SLIP: {}, "latency": {}}, {"live_alarms_per_minute": own.alarms_per_minute})
+        with settings.naming("plan"):
+            planned = plans.with_plan(rig, own.plan, own.plan_from)
+        if config["params"].get("actions") == "planned" and PLAN not in planned.streams:
+            raise UsageError(
+                "The model reads planned motion, and this session has no source of plans. Give --plan udp::PORT or "
+                "--plan ws:HOST:PORT, and send plans to it."
+            )
+        attributes: dict[str, Attribute] = {"live_alarms_per_minute": own.alarms_per_minute, "live_plan": own.plan}
+        return SessionPlan(planned, own, {SLIP: {}, "latency": {}}, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> SlipEngine:
         """Return the engine of a session, which has scored its first window.
@@ -73,6 +89,7 @@ class SlipLive(LiveTask):
         from tacpipe.tasks.slip.live.engine import SlipEngine
         from tacpipe.tasks.slip.live.messages import SlipDescription
         from tacpipe.tasks.slip.model import SlipModel
+        from tacpipe.tasks.slip.planned import PlannedMotion
 
         loaded = SlipModel.load(model.files)
         if not loaded.scorer.runs_live:
@@ -81,12 +98,15 @@ class SlipLive(LiveTask):
         fingers = loaded.reader.fingers
         layouts = {finger.stream: _grid(finger.layout) for finger in fingers}
         description = SlipDescription(settings.model, loaded.config["rate_hz"], loaded.params.horizon_s, name, layouts)
-        loaded.scorer.score_window(
-            loaded.reader, [np.zeros((finger.rows, len(finger.channels))) for finger in fingers]
-        )  # imports and allocates what the first sample would wait for
+        windows = [np.zeros((finger.rows, len(finger.channels))) for finger in fingers]
+        streams = [finger.stream for finger in fingers]
+        if loaded.reader.reads_plans:
+            windows.append(PlannedMotion().ahead(0))
+            streams.append(PLAN)
+        loaded.scorer.score_window(loaded.reader, windows)  # imports and allocates what the first sample would wait for
         return SlipEngine(
             loaded,
-            {finger.stream: sensors[finger.stream] for finger in fingers},
+            {stream: sensors[stream] for stream in streams},
             description,
             loaded.calibration.levels[name],
             settle_ns=round(settings.settle_ms * 1e6),
