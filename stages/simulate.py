@@ -20,6 +20,7 @@ from tacpipe.plugins.constraints import (
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
+Handling = Literal["planned", "mixed", "jolt", "jolt-held", "fade", "fade-held", "release", "shake", "hold"]
 Families = Annotated[
     str, CommaList(Literal["all", "box", "cylinder", "sphere", "ellipsoid", "cone", "bow"], min_items=1)
 ]
@@ -59,6 +60,23 @@ class Params:
     clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # maximum skew of a device's own clock
     # plans per second that the arm's controller sends, each of the next second; 0: no stream plan
     plan_rate_hz: Annotated[NonNegativeFloat, Unit("Hz")] = added(0.0)
+    # what happens to the object, with friction and mass of 20 objects; replaces effort, grip loss and still.
+    # jolt: moves until it slips; jolt-held: nearly slips; fade: the grip weakens until it slips; fade-held: nearly slips;
+    # release: the gripper opens on purpose; shake, hold: no event; mixed: all; planned: none of these
+    handling: Handling = added("planned")
+
+    def check(self) -> None:
+        """Raise an error for a handling next to params that it replaces."""
+        _check_handling(self)
+        if self.handling != "planned" and self.still:
+            raise UsageError(f"handling is {self.handling}, and still is set. Leave one of them out.")
+
+
+def _check_handling(params: Params | GelParams) -> None:
+    """Raise `UsageError` if a handling is set next to effort or a loss of grip, which it replaces."""
+    if params.handling != "planned" and (params.effort or params.grip_loss_probability):
+        name = "effort" if params.effort else "grip_loss_probability"
+        raise UsageError(f"handling is {params.handling}, and {name} is set. Leave one of them out.")
 
 
 def _rig_options(params: Params | MaterialParams | TouchParams | GelParams) -> dict[str, Any]:
@@ -171,11 +189,19 @@ class GelParams:
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # factor of the drawn friction; with 4 nothing slips
     grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip weakens without warning
+    # what happens to the object, with friction and mass of 20 objects; replaces effort, grip loss and still.
+    # jolt: moves until it slips; jolt-held: nearly slips; fade: the grip weakens until it slips; fade-held: nearly slips;
+    # release: the gripper opens on purpose; shake, hold: no event; mixed: all; planned: none of these
+    handling: Handling = added("planned")
     frame_rate_hz: Annotated[PositiveInt, Unit("Hz")] = 25  # frames per second of each camera
     drop_probability: Fraction = 0.002  # fraction of frames that are lost
     noise_scale: NonNegativeFloat = 1.0  # multiple of the noise of the cameras
     # mean and standard deviation of a frame's latency
     jitter_ms: Annotated[NonNegativeFloat, Unit("ms")] = 2.0
+
+    def check(self) -> None:
+        """Raise an error for a handling next to params that it replaces."""
+        _check_handling(self)
 
 
 @stage(version=1)

@@ -19,7 +19,7 @@ from tacpipe.arrays import Bytes, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.simulation import faults, pick_and_move
+from tacpipe.simulation import faults, handling, pick_and_move
 from tacpipe.simulation.pick_and_move import PickRig, PickScene
 from tacpipe.video.encoding import ENCODED_BY, encode_images, jpeg_format
 from tacpipe.video.files import packet_stream
@@ -124,6 +124,7 @@ class GelRig:
     effort: float = 0.0
     friction_scale: float = 1.0
     grip_loss_probability: float = 0.0
+    handling: str = handling.PLANNED
     frame_rate_hz: int = 25
     drop_probability: float = 0.002
     noise_scale: float = 1.0
@@ -142,6 +143,7 @@ def simulate_trial(seed: int, index: int, rig: GelRig = GelRig()) -> RecordingOu
         effort=rig.effort,
         friction_scale=rig.friction_scale,
         grip_loss_probability=rig.grip_loss_probability,
+        handling=rig.handling,
         drop_probability=rig.drop_probability,
         robot_jitter_ms=rig.jitter_ms / 4,
     )

@@ -18,19 +18,19 @@ and z.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tacpipe.arrays import AnyArray, Floats, Times
+from tacpipe.arrays import AnyArray, Bools, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.sensors import plan
-from tacpipe.simulation import faults, mechanics, taxels, trajectory
+from tacpipe.simulation import faults, handling, mechanics, taxels, trajectory
 
 # The proximity sensor at the wrist measures the distance to the object's top face, which increases with slip. Rest level,
 # slope, noise and saturation are those of the published derived recordings: 737 to 748 counts at rest, a minimum of 544, and
@@ -57,6 +57,7 @@ FRICTION = (0.35, 0.60)  # mu_s
 RESERVE = 1.3  # smallest 2 mu_s N per weight: slip starts at 0.3 g or more, and kinetic friction carries the weight
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
+HANDLING_STREAM = 3  # random numbers of a handling, next to those of the rig's devices and of cameras
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
 MEMORY_BYTES = 1 << 24  # size of streams above which they move to disk
 PLAN_S, PLAN_POINT_S = 1.0, 0.02  # length of a plan, and the time between its points
@@ -79,6 +80,7 @@ class PickRig:
     grip_loss: float = 0.2
     lever_m: float = 0.0
     still: bool = False
+    handling: str = handling.PLANNED  # one of `handling.HANDLINGS`, or mixed; replaces effort, friction and grip
     tactile_rate_hz: float = 50.0
     robot_rate_hz: float = 1000.0
     hold_probability: float = 0.07
@@ -102,6 +104,14 @@ class PickScene:
     contact: mechanics.Contact
     skins: tuple[taxels.Skin, taxels.Skin]
     loss_ns: int | None  # time of a loss of grip
+    handling: str = handling.PLANNED
+    release_ns: int | None = None  # time at which the gripper begins to open on purpose
+
+    @property
+    def has_contact(self) -> Bools:
+        """Whether the fingers hold the object (time,); False from the start of a release."""
+        contact: Bools = self.contact.normal_n.max(axis=1) > 0
+        return contact if self.release_ns is None else contact & (self.path.t_ns < self.release_ns)
 
 
 def simulate_trial(seed: int, index: int, rig: PickRig = PickRig()) -> RecordingOutput:
@@ -161,18 +171,31 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     approach_s, pause_s = rng.uniform(*APPROACH_S), rng.uniform(*PAUSE_S)
     chance = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
     protocol = chance if rig.protocol == "mixed" else rig.protocol
-    if rig.still:
+    course = None
+    if rig.handling != handling.PLANNED:
+        own_rng = np.random.default_rng([seed, index, HANDLING_STREAM])
+        course = handling.draw_plan(rig.handling, protocol, rig.duration_s, approach_s + RAMP_S + pause_s, own_rng)
+        path = course.path
+    elif rig.still:
         path = trajectory.rest(rig.duration_s)
-        closing, squeeze = np.ones(len(path.t_ns)), np.ones(len(path.t_ns))
     else:
         path = trajectory.draw_trajectory(protocol, rig.duration_s, approach_s + RAMP_S + pause_s, rng)
+    if rig.still:
+        closing, squeeze = np.ones(len(path.t_ns)), np.ones(len(path.t_ns))
+    else:
         closing = _ease(path.t_ns / 1e9 / approach_s)
         squeeze = _ease((path.t_ns / 1e9 - approach_s) / RAMP_S)
     mass_kg = float(MASSES_KG[rng.integers(len(MASSES_KG))])
     load_n = np.linalg.norm(
         mechanics.HeldObject(mass_kg, 1.0, squeeze).demand_n(path.hand_acceleration_m_s2)[:, ::2], axis=1
     )
-    grip_n, friction = _draw_grip(mass_kg, float(load_n.max()), rig.effort, rng)
+    if course is None:
+        grip_n, friction = _draw_grip(mass_kg, float(load_n.max()), rig.effort, rng)
+    else:
+        friction, grip_n = course.friction, float(load_n.max()) / (2 * course.effort * course.friction)
+        opening = course.grip(load_n)
+        squeeze = squeeze * opening
+        closing = closing * opening if course.release is not None else closing
     grasp = mechanics.HeldObject(mass_kg, friction * rig.friction_scale, grip_n * squeeze, rig.lever_m)
     loss_ns = None
     if rng.random() < rig.grip_loss_probability:
@@ -183,7 +206,12 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     rise_m = None if rig.still else path.rise_m
     contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
     skins = (taxels.draw_skin(rng), taxels.draw_skin(rng))
-    return PickScene(protocol, path, OPEN_M + (GRASPED_M - OPEN_M) * closing, grasp, contact, skins, loss_ns)
+    finger_m = OPEN_M + (GRASPED_M - OPEN_M) * closing
+    scene = PickScene(protocol, path, finger_m, grasp, contact, skins, loss_ns)
+    if course is None:
+        return scene
+    release_ns = None if course.release is None else int(path.t_ns[course.release])
+    return replace(scene, handling=course.kind, release_ns=release_ns)
 
 
 def touch(
@@ -315,6 +343,8 @@ def _clock_fields() -> list[Any]:
 def _truth(scene: PickScene, start_ns: int) -> Callable[[slice], pa.Table]:
     """Return a function that returns a block of rows of the stream ``truth`` at 1 kHz."""
     contact, acceleration_m_s2 = scene.contact, scene.path.acceleration_m_s2
+    # an object that slides out of opening fingers is released
+    slip = contact.slip if scene.release_ns is None else contact.slip & scene.has_contact
 
     def build_rows(block: slice) -> pa.Table:
         columns: list[tuple[Any, Any]] = [
@@ -331,8 +361,11 @@ def _truth(scene: PickScene, start_ns: int) -> Callable[[slice], pa.Table]:
         columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad[block]))
         mass = np.full(len(moved), scene.grasp.mass_kg)
         columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
-        columns.append((schema.label_field("gt_slip"), contact.slip[block]))
+        columns.append((schema.label_field("gt_slip"), slip[block]))
         columns.append((schema.label_field("gt_dropped"), contact.dropped[block]))
+        if scene.handling != handling.PLANNED:
+            touched = np.where(scene.has_contact[block], 0, -1).astype(np.int8)
+            columns.append((schema.label_field("gt_contact"), touched))
         fields, values = zip(*columns, strict=True)
         return schema.stream(start_ns + scene.path.t_ns[block], values, fields)
 
@@ -348,14 +381,16 @@ def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[
 
 def _attributes(scene: PickScene, index: int, start_ns: int, rig: PickRig) -> dict[str, Attribute]:
     contact, grasp = scene.contact, scene.grasp
-    onset_ns = None if contact.onset is None else start_ns + int(scene.path.t_ns[contact.onset])
-    return {
+    is_released = scene.release_ns is not None
+    onset = None if is_released else contact.onset
+    onset_ns = None if onset is None else start_ns + int(scene.path.t_ns[onset])
+    attributes: dict[str, Attribute] = {
         "sensor": "xela-uskin",
         "simulated": True,
         "object": f"bottle-{round(grasp.mass_kg * 1000)}g",
         "object_class": "bottle",
         "protocol": "still" if rig.still else scene.protocol,
-        "dropped": bool(contact.dropped.any()),
+        "dropped": bool(contact.dropped.any()) and not is_released,
         "rate_hz": rig.tactile_rate_hz,
         "trial": f"trial-{index:04d}",
         "gt_mass_kg": grasp.mass_kg,
@@ -363,6 +398,13 @@ def _attributes(scene: PickScene, index: int, start_ns: int, rig: PickRig) -> di
         "gt_friction": grasp.friction,
         "gt_slip_onset_ns": onset_ns,
         "gt_grip_loss_ns": None if scene.loss_ns is None else start_ns + scene.loss_ns,
+    }
+    if scene.handling == handling.PLANNED:
+        return attributes
+    return attributes | {
+        "object": f"{attributes['object']}-friction-{grasp.friction:.2f}",
+        "handling": scene.handling,
+        "gt_release_ns": None if scene.release_ns is None else start_ns + scene.release_ns,
     }
 
 

@@ -85,6 +85,11 @@ def draw_trajectory(protocol: str, duration_s: float, first_s: float, rng: np.ra
     return Trajectory(_stamps(rows), path + START_M, yaw)
 
 
+def path_from_start(moved_m: Floats) -> Trajectory:
+    """Return the trajectory of a hand that is displaced from its start by ``moved_m`` (time, axis), without yaw."""
+    return Trajectory(_stamps(len(moved_m)), moved_m + START_M, np.zeros(len(moved_m)))
+
+
 def rest(duration_s: float) -> Trajectory:
     """Return the trajectory of a lifted hand at rest."""
     rows = round(duration_s * RATE_HZ) + 1

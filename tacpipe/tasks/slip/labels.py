@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 ATTRIBUTE = "slip_intervals"
 COLUMNS = ("slip", "slip_slip", "gt_slip")  # columns of stages, synchronized label streams and the simulator
-CONTACT = "contact"  # column of `segment contacts` and `segment losses`; negative without contact
+# columns of `segment contacts` and `segment losses`, and of the simulator; negative without contact
+CONTACT = ("contact", "gt_contact")
 MERGED_NS = 200_000_000  # slips that are closer than this are one event
 
 
@@ -74,7 +75,7 @@ def merge_events(parts: Sequence[Times]) -> Times:
 
 
 def _contact(recording: Recording) -> tuple[Times, Bools] | None:
-    columns = _columns(recording, (CONTACT,))
+    columns = _columns(recording, CONTACT)
     if not columns:
         return None
     t_ns, values = columns[0]
