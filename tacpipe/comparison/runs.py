@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 
 import numpy as np
 
+from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import Scalar
 from tacpipe.metrics import pairing
 from tacpipe.plugins import registry
@@ -131,11 +132,15 @@ class ComparedRun(Generic[Details]):
     family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None
-    simulated: bool = False
     # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
     control: bool = False
     published: bool = False  # whether it was evaluated only on the recordings of the task's paper
     details: Details = None  # type: ignore[assignment]  # data for the task's own sections, if it has any
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any of the recordings was simulated."""
+        return is_simulated(self.dataset)
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,6 +146,11 @@ class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
 PUBLISHED, SIMULATED = "published", "simulated"
 
 
+def is_simulated(dataset: Dataset) -> bool:
+    """Return whether any recording of a dataset was simulated."""
+    return any(bool(recording.attributes.get(SIMULATED)) for recording in dataset.recordings.values())
+
+
 def combine_origins(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
     """Return the attributes of a result of several recordings: simulated if any of them is, published if all are.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
-from tacpipe.datasets.selection import PUBLISHED
+from tacpipe.datasets.selection import PUBLISHED, is_simulated
 from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins import params as params_of
@@ -124,11 +124,6 @@ def _result_key(result: Dataset) -> str:
 
 
 SIMULATED = "These recordings were simulated, so the results are not evidence about real sensors."
-
-
-def is_simulated(result: Dataset) -> bool:
-    """Return whether any recording of a result was simulated."""
-    return any(bool(shard.attributes.get("simulated")) for shard in result.recordings.values())
 
 
 def is_published(result: Dataset, sets: Collection[str]) -> bool:

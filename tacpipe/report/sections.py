@@ -11,6 +11,7 @@ import numpy as np
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, TaskReport, grouped
+from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import JsonObject
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
@@ -31,7 +32,7 @@ from tacpipe.report.blocks import (
     table,
 )
 from tacpipe.report.blocks import Row as Line
-from tacpipe.report.context import SIMULATED, Context, is_simulated, median_run, provenance_blocks
+from tacpipe.report.context import SIMULATED, Context, median_run, provenance_blocks
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset

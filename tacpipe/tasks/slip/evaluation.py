@@ -11,11 +11,11 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.datasets import model_files
+from tacpipe.datasets.selection import combine_origins
 from tacpipe.errors import TacpipeError
-from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure, Sums
-from tacpipe.plugins.stage import Result
+from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
 from tacpipe.tasks.slip.metrics import WindowScores
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 MODEL = "model"
-WINDOWS, EVENTS = "windows.parquet", "events.json"
+WINDOWS, EVENTS = "windows", "events.json"
 
 
 def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -53,14 +53,15 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
     evaluated = EvaluatedSlips.from_windows(windows, scores, probabilities, levels)
     architecture = str(model.config["architecture"])
     compared = headline_of(architecture, evaluated)
+    origin = combine_origins(recordings.recordings[track.name].attributes for track in evaluated.tracks)
     return Result(
-        files={
+        {WINDOWS: RecordingOutput(evaluated.to_table(), origin)},
+        {
             model_files.CONFIG: files[model_files.CONFIG],
             "metrics.json": model_files.to_json(evaluated.measure(model.horizon_ns)),
-            WINDOWS: evaluated.to_parquet(),
             EVENTS: evaluated.events_json(),
             headline.FILE: headline.write([compared] if compared else []),
-        }
+        },
     )
 
 
@@ -161,7 +162,7 @@ class EvaluatedSlips:
             for track, values in zip(self.tracks, self.probabilities[predictor], strict=True)
         }
 
-    def to_parquet(self) -> bytes:
+    def to_table(self) -> pa.Table:
         """Return the table of all windows."""
 
         def column(values: Sequence[Any]) -> Any:
@@ -178,7 +179,7 @@ class EvaluatedSlips:
         for name in self.scores:
             table[f"score_{name}"] = pa.array(column(self.scores[name]))
             table[f"probability_{name}"] = pa.array(column(self.probabilities[name]))
-        return to_parquet(pa.table(table))
+        return pa.table(table)
 
     def events_json(self) -> bytes:
         """Return the slips and the alarm levels of each recording."""
@@ -189,10 +190,10 @@ class EvaluatedSlips:
         return model_files.to_json(content)
 
     @classmethod
-    def from_files(cls, files: Mapping[str, bytes]) -> EvaluatedSlips:
+    def from_result(cls, result: Dataset) -> EvaluatedSlips:
         """Return the evaluation of a result."""
-        table = from_parquet(files[WINDOWS])
-        described = model_files.tree(files, EVENTS)
+        table = result.recordings[WINDOWS].table()
+        described = model_files.tree(result.files, EVENTS)
         names = table["recording"].to_numpy(zero_copy_only=False)
         predictors = [name.removeprefix("score_") for name in table.column_names if name.startswith("score_")]
         values = {name: table[name].to_numpy() for name in table.column_names if name not in ("recording", "object")}

@@ -40,10 +40,10 @@ class SlipReport(TaskReport):
         """Return one run per result."""
         runs = []
         for result in results:
-            if WINDOWS not in result.files or EVENTS not in result.files:
+            if WINDOWS not in result.recordings or EVENTS not in result.files:
                 continue
             config = json.loads(result.files["config.json"])
-            evaluated = EvaluatedSlips.from_files(result.files)
+            evaluated = EvaluatedSlips.from_result(result)
             sums = {
                 name: {recording: parts for (_, recording), parts in evaluated.sums(name).items()}
                 for name in evaluated.scores

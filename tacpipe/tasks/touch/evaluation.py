@@ -302,9 +302,8 @@ def _grasp_table(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Tabl
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
-    """Return the attribute that marks results of simulated recordings; None if all recordings are real."""
-    is_simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
-    return {"simulated": True} if is_simulated else {}
+    """Return the attribute that marks results of simulated recordings; empty if all recordings are real."""
+    return {selection.SIMULATED: True} if selection.is_simulated(recordings) else {}
 
 
 def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = None) -> pa.Table:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tests.fake_recordings import FakeRecording
+from tacpipe.plugins.stage import Result
+from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 
 RATE_HZ = 20.0
 SECONDS = 10.0
@@ -24,6 +25,14 @@ def skin_fields(taxels: int = 2) -> list[pa.Field]:
         for taxel in range(1, taxels + 1)
         for axis in "xyz"
     ]
+
+
+def stored(result: Result) -> Any:
+    """Return the dataset that a result is stored as."""
+    tables = {
+        name: FakeShard(name, output.streams[""], output.attributes) for name, output in result.recordings.items()
+    }
+    return FakeDataset(tables, result.files)
 
 
 def held_object(seed: int, slip_s: float | None, rise_s: float = 1.0, **attributes: Any) -> FakeRecording:

@@ -14,7 +14,7 @@ from tacpipe.tasks.slip import evaluation, training
 from tacpipe.tasks.slip.params import Boosting
 from tacpipe.tasks.slip.report import ALARM_HEADS, SlipReport, alarm_table, area_table, pooled_metrics
 from tests.fake_recordings import FakeDataset, dataset
-from tests.tasks.slip.slip_recordings import trials
+from tests.tasks.slip.slip_recordings import stored, trials
 
 SMALL = Boosting(trees=10, leaves=4, leaf=10, learning_rate=0.3)
 
@@ -26,7 +26,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     files = training.train(SMALL, dataset(*trials(12)), None, folder / "a")
     shuffled = training.train(dataclasses.replace(SMALL, labels="shuffled"), dataset(*trials(12)), None, folder / "b")
     return [
-        FakeDataset(files=evaluation.evaluate(model, dataset(*trials(6, first))).files)
+        stored(evaluation.evaluate(model, dataset(*trials(6, first, simulated=first == 200))))
         for model, first in ((files, 100), (files, 200), (shuffled, 100))
     ]
 
@@ -35,6 +35,7 @@ def test_runs_have_the_brier_score_of_each_predictor_and_the_control_is_marked(r
     without_windows: Any = FakeDataset()
     runs = SlipReport("slip").read([*results, without_windows])
     assert [run.control for run in runs] == [False, False, True]
+    assert [run.simulated for run in runs] == [False, True, False]
     (errors,) = runs[0].questions.values()
     metrics = json.loads(results[0].files["metrics.json"])
     for predictor in ("model", "time_only", "constant"):

@@ -18,7 +18,7 @@ from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule
 from tacpipe.tasks.slip.rule import score_forecasts
 from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import FakeRecording, dataset
-from tests.tasks.slip.slip_recordings import held_object, trials
+from tests.tasks.slip.slip_recordings import held_object, stored, trials
 
 SMALL = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2)
 
@@ -53,7 +53,7 @@ def test_recordings_that_the_model_was_trained_on_are_not_evaluated(files: dict[
 
 def test_a_result_reads_back_as_it_was_evaluated(files: dict[str, bytes]) -> None:
     result = evaluation.evaluate(files, dataset(*trials(6, 100)))
-    again = evaluation.EvaluatedSlips.from_files(result.files)
+    again = evaluation.EvaluatedSlips.from_result(stored(result))
     assert again.measure(1_000_000_000) == json.loads(result.files["metrics.json"])
 
 

@@ -324,7 +324,6 @@ def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
         questions,
         family=str(config["architecture"]).replace("_", " "),
         seed=run.given.get("seed"),
-        simulated=run.simulated,
         published=run.published,
         control=run.actions == "shuffled",
         details=run,

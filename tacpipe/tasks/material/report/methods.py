@@ -335,7 +335,6 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
         family=base_name(settings, variants=False),
         seed=result.params.get("seed"),
         fold=result.config.get("fold"),
-        simulated=result.simulated,
         published=result.published,
         control=not has_usual_settings(settings, "elsewhere"),
         details=result,

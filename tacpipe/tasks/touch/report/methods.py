@@ -328,7 +328,6 @@ def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> Com
         questions,
         family=kind_of(run.architecture).TITLE or run.architecture,
         seed=run.params.get("seed"),
-        simulated=run.simulated,
         published=run.published,
         details=run,
     )
