@@ -139,7 +139,7 @@ class ComparedRun(Generic[Details]):
 
     @property
     def simulated(self) -> bool:
-        """Whether any of the recordings was simulated."""
+        """Return whether any of the recordings was simulated."""
         return is_simulated(self.dataset)
 
 
@@ -155,17 +155,17 @@ class Method(Generic[Details]):
 
     @property
     def control(self) -> bool:
-        """Whether it was trained to show the size of an effect and does not compete."""
+        """Return whether it was trained to show the size of an effect and does not compete."""
         return self.runs[0].control
 
     @property
     def simulated(self) -> bool:
-        """Whether any of its runs was evaluated on simulated recordings."""
+        """Return whether any of its runs was evaluated on simulated recordings."""
         return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
-        """Whether all its runs were evaluated on the recordings of the task's paper."""
+        """Return whether all its runs were evaluated on the recordings of the task's paper."""
         return all(run.published for run in self.runs)
 
     @property
