@@ -57,8 +57,9 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
 
     slipped = recording.attributes.get("slip")
     if not isinstance(slipped, bool):
+        value = "no label slip" if slipped is None else f"the label slip {slipped!r}"
         raise TacpipeError(
-            f"Recording {recording.name} has the label slip {slipped!r}; it must be true or false. Set it with "
+            f"Recording {recording.name} has {value}; it must be true (the object slipped out) or false. Set it with "
             f"`tacpipe label DATASET {recording.name} --label slip=true`."
         )
     tables = {stream: recording.table(stream) for stream in recording.streams}

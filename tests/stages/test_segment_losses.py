@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -59,9 +60,10 @@ def test_a_slip_whose_contact_is_not_seen_has_no_known_time() -> None:
     assert set(column(output.streams["gel0"], "slip").tolist()) == {-1}
 
 
-def test_a_recording_that_does_not_state_whether_the_object_slipped_is_refused() -> None:
-    recording = dataclasses.replace(gel(slip=True), attributes={})
-    with pytest.raises(TacpipeError, match="must be true or false"):
+@pytest.mark.parametrize(("labels", "message"), [({}, "has no label slip"), ({"slip": 1.0}, "has the label slip 1.0")])
+def test_a_recording_that_does_not_state_whether_the_object_slipped_is_refused(labels: Any, message: str) -> None:
+    recording = dataclasses.replace(gel(slip=True), attributes=labels)
+    with pytest.raises(TacpipeError, match=f"{message}; it must be true"):
         registry.load("segment.losses")(build_params("segment.losses"), recording)
 
 
