@@ -1,4 +1,4 @@
-"""Simulate the coverage of intervals: ``python docs/intervals.py``, about five minutes on one core.
+"""Simulate the coverage of intervals: ``python docs/intervals.py``, about ten minutes on one core.
 
 The script draws recordings with a given true skill and computes the interval of the gain with the code of tacpipe. It counts
 how often the interval contains the true gain, and how often the best of several equal methods is called better. It prints
@@ -8,12 +8,13 @@ the tables of ``docs/benchmarks/intervals.md``. The optional argument is the num
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
+from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from tacpipe.arrays import AnyFloats, Floats
@@ -22,6 +23,9 @@ from tacpipe.metrics.headline import MIN_CLUSTERS
 from tacpipe.metrics.intervals import wilson
 from tacpipe.metrics.pairing import Measure
 from tacpipe.tasks.forward import headline as forward
+from tacpipe.tasks.slip import metrics as slip
+from tacpipe.tasks.slip.calibration import ScoredTrack
+from tacpipe.tasks.slip.windows import BEFORE, STABLE
 from tacpipe.tasks.touch import headline as touch
 
 REPEATS, RESAMPLES = 1000, 500
@@ -219,6 +223,72 @@ def rate_coverage(materials: int, slides: int = 16, repeats: int = REPEATS) -> R
     return RateCoverage(same, over_slides, over_materials if materials >= MIN_CLUSTERS else float("nan"))
 
 
+class AreaCoverage(NamedTuple):
+    """Coverage of intervals over objects, of an area under the ROC curve and of the margin over a baseline."""
+
+    percentile: float  # percentile bootstrap over objects
+    jackknife: float  # the interval of `tacpipe.tasks.slip.metrics`
+    margin: float  # the same for the margin
+
+
+@dataclass(frozen=True)
+class ScoreModel:
+    """Normal scores of windows: the sum of parts that objects, recordings and windows have, and the effect of a slip."""
+
+    area: float  # in the limit of infinitely many objects
+    object_sd: float = 1.0
+    recording_sd: float = 0.5
+    window_sd: float = 0.7
+    effect_sd: float = 0.5  # standard deviation of the effect of a slip over objects
+
+    @property
+    def effect(self) -> float:
+        """Mean effect of a slip: the difference of two scores of different objects is normal."""
+        spread = 2 * (self.object_sd**2 + self.recording_sd**2 + self.window_sd**2) + self.effect_sd**2
+        return float(normal.ppf(self.area) * np.sqrt(spread))
+
+
+RECORDINGS, SLIP_SHARE, STABLE_ROWS, SLIP_ROWS = 5, 0.35, 10, 20  # per object, of the recordings, and per recording
+BASELINE_AREA = 0.6
+
+
+def draw_scores(rng: np.random.Generator, objects: int, models: Sequence[ScoreModel]) -> list[list[ScoredTrack]]:
+    """Return the recordings of some objects with the scores of each model, which share a part of each object."""
+    tracks: list[list[ScoredTrack]] = [[] for _ in models]
+    for number in range(objects):
+        shared = rng.standard_normal()
+        own = rng.standard_normal((len(models), 2))
+        for recording in range(1 + rng.poisson(RECORDINGS - 1)):
+            slips = rng.random() < SLIP_SHARE
+            states = np.array([STABLE] * STABLE_ROWS + [BEFORE if slips else STABLE] * SLIP_ROWS)
+            t_ns = np.arange(len(states)) * 100_000_000
+            events = np.array([[t_ns[-1]] * 2] if slips else [], np.int64).reshape(-1, 2)
+            for part, model, (level, effect) in zip(tracks, models, own, strict=True):
+                scores = model.object_sd * (shared + level) / np.sqrt(2) + model.recording_sd * rng.standard_normal()
+                scores = scores + model.window_sd * rng.standard_normal(len(states))
+                scores = scores + (states == BEFORE) * (model.effect + model.effect_sd * effect)
+                name, weights = f"{number}-{recording}", np.ones(len(states))
+                part.append(ScoredTrack(name, str(number), t_ns, states, scores, events, weights, t_ns / 1e9))
+    return tracks
+
+
+def area_coverage(objects: int, area: float, repeats: int = REPEATS) -> AreaCoverage:
+    """Return the coverage of intervals of areas and margins with some objects."""
+    rng, models = np.random.default_rng(objects), (ScoreModel(area), ScoreModel(BASELINE_AREA))
+    draws = rng.multinomial(objects, np.full(objects, 1 / objects), RESAMPLES).astype(np.float64)
+    covered = np.full((repeats, 3), np.nan)
+    for repeat in range(repeats):
+        model, baseline = (slip.WindowScores(tracks) for tracks in draw_scores(rng, objects, models))
+        low, high = np.nanquantile(model.area("before").selected(draws), [0.025, 0.975])
+        ends = slip.areas(model)["before"], slip.margin(model, baseline)
+        truths = area, area - BASELINE_AREA
+        covered[repeat, 0] = low <= area <= high
+        for column, (estimate, truth) in enumerate(zip(ends, truths, strict=True), start=1):
+            if estimate["low"] is not None and estimate["high"] is not None:
+                covered[repeat, column] = estimate["low"] <= truth <= estimate["high"]
+    return AreaCoverage(*(float(share) for share in np.nanmean(covered, axis=0)))
+
+
 def lines(repeats: int = REPEATS) -> Iterator[str]:
     """Yield the lines of the tables."""
     yield "| measure | recordings | n | with a verdict | coverage | percentile bootstrap | studentized bootstrap |"
@@ -245,6 +315,13 @@ def lines(repeats: int = REPEATS) -> Iterator[str]:
         same, slides, by_material = rate_coverage(materials, repeats=repeats)
         cell = "no interval" if np.isnan(by_material) else f"{by_material:.3f}"
         yield f"| {materials} | {same:.3f} | {slides:.3f} | {cell} |"
+    yield ""
+    yield "| objects | area under the curve | percentile bootstrap | coverage | of the margin over a baseline |"
+    yield "| --- | --- | --- | --- | --- |"
+    for objects in (6, 10, 26, 41):
+        for area in (0.55, 0.72, 0.86, 0.97):
+            shares = area_coverage(objects, area, repeats)
+            yield f"| {objects} | {area:.2f} | " + " | ".join(f"{share:.3f}" for share in shares) + " |"
 
 
 if __name__ == "__main__":

@@ -120,19 +120,18 @@ class EvaluatedSlips:
     def measure(self, horizon_ns: int) -> dict[str, Any]:
         """Return the metrics of each predictor, and the margin of the model over each baseline."""
         windows = {name: WindowScores(self.scored_by(name)) for name in self.scores}
-        draws = metrics.object_draws(windows[MODEL].object_count)
         by_predictor: dict[str, Any] = {}
         for name, own in windows.items():
             probabilities = np.concatenate([np.zeros(0), *self.probabilities[name]])
             brier = metrics.brier(probabilities, own.states > STABLE, own.weights)
             by_predictor[name] = {
-                "auc": metrics.areas(own, draws),
+                "auc": metrics.areas(own),
                 "brier": float(f"{brier:.6g}") if brier == brier else None,
-                "accuracy": metrics.accuracy(probabilities, own, draws),
-                "alarms": self.alarms(name, horizon_ns, draws),
+                "accuracy": metrics.accuracy(probabilities, own),
+                "alarms": self.alarms(name, horizon_ns),
             }
             if name != MODEL:
-                by_predictor[name]["margin"] = metrics.margin(windows[MODEL], own, draws)
+                by_predictor[name]["margin"] = metrics.margin(windows[MODEL], own)
         counts = {
             "recordings": len(self.tracks),
             "objects": windows[MODEL].object_count,
@@ -142,13 +141,13 @@ class EvaluatedSlips:
         }
         return {**by_predictor, "counts": counts, "parts": metrics.PARTS}
 
-    def alarms(self, predictor: str, horizon_ns: int, draws: Floats) -> dict[str, metrics.SlipAlarmScore]:
+    def alarms(self, predictor: str, horizon_ns: int) -> dict[str, metrics.SlipAlarmScore]:
         """Return the score of a predictor's alarm for each rate of false alarms; empty for a constant."""
         tracks = self.scored_by(predictor)
         rates = next(iter(self.levels.values())).get(predictor, {})
         return {
             rate: metrics.score_alarm(
-                tracks, {track.name: self.levels[track.name][predictor][rate] for track in tracks}, horizon_ns, draws
+                tracks, {track.name: self.levels[track.name][predictor][rate] for track in tracks}, horizon_ns
             )
             for rate in rates
         }

@@ -1,4 +1,9 @@
-"""Measure scores of slips: area under the curve by kind of window, lead times, and intervals over objects."""
+"""Measure scores of slips: area under the curve by kind of window, lead times, and intervals over objects.
+
+Intervals of areas are jackknife intervals over objects on the scale of log odds, with Student's t. An area is a sum over
+pairs of objects, so leaving out an object removes its row and its column of pairs (Obuchowski, Nonparametric analysis of
+clustered ROC curve data, Biometrics 53, 1997). ``docs/benchmarks/intervals.md`` has their coverage.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +13,16 @@ from typing import Literal, TypedDict
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s
+from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s
+from tacpipe.metrics.intervals import MIN_INTERVAL_CLUSTERS, Jackknife, effective_number, share_interval
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
 
 LEADS_S = (0.2, 0.5, 1.0)  # times before the start of a slip at which the area under the curve is measured
 LEAD_WIDTH_S = 0.1  # half the width of the windows around such a time
 EARLY_S = (2.0, 3.0)  # times before the start of a slip of the control of windows that are too early
-DRAWS = 1000  # draws of objects per interval
-INTERVAL = (0.025, 0.975)
+ROUNDING = 1e-9  # largest standard error that counts as none
+SMALLEST_SHARE = 1e-3  # smallest share, and smallest distance from 1, that is transformed to log odds
 SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 PARTS = {  # kinds of windows of the area under the curve -> meaning
@@ -53,7 +59,7 @@ class SlipAlarmScore(TypedDict):
 
 @dataclass(frozen=True)
 class Area:
-    """An area under the curve as sums by object, from which that of any draw of objects follows."""
+    """An area under the curve as sums by object, from which that of any selection of objects follows."""
 
     wins: Floats  # (object of the slip, object of the stable contact), weighted pairs in which the slip scores higher
     positives: Floats  # (object,), weight of windows with a slip
@@ -62,15 +68,26 @@ class Area:
     @property
     def value(self) -> float:
         """The area over all objects; NaN without pairs."""
-        return float(self.drawn(np.ones((1, len(self.positives))))[0])
+        return float(self.selected(np.ones((1, len(self.positives))))[0])
 
-    def drawn(self, draws: Floats) -> Floats:
-        """Return the area (draw,) of each draw of objects (draw, object)."""
+    @property
+    def without(self) -> Floats:
+        """The area without each object (object,)."""
+        return self.selected(1 - np.eye(len(self.positives)))
+
+    @property
+    def effective(self) -> float:
+        """The effective number of objects: that of slips or of stable contact, whichever is smaller."""
+        parts = [self.positives] if self.negatives is None else [self.positives, self.negatives]
+        return min(float(effective_number(part)) for part in parts)
+
+    def selected(self, objects: Floats) -> Floats:
+        """Return the area (selection,) of objects, for the number of each in each selection (selection, object)."""
         if self.negatives is None:
-            won, pairs = draws @ np.diag(self.wins), draws @ self.positives
+            won, pairs = objects @ np.diag(self.wins), objects @ self.positives
         else:
-            won = ((draws @ self.wins) * draws).sum(axis=1)
-            pairs = (draws @ self.positives) * (draws @ self.negatives)
+            won = ((objects @ self.wins) * objects).sum(axis=1)
+            pairs = (objects @ self.positives) * (objects @ self.negatives)
         area: Floats = np.where(pairs > 0, won / np.where(pairs > 0, pairs, 1), np.nan)
         return area
 
@@ -160,33 +177,55 @@ def _joined(parts: Sequence[AnyFloats | Bools | Int64s]) -> AnyFloats:
     return np.concatenate([np.zeros(0), *parts])
 
 
-def object_draws(count: int, seed: int = 0) -> Floats:
-    """Return how often each object is in each draw with replacement (draw, object)."""
-    rng = np.random.default_rng(seed)
-    return np.stack([np.bincount(rng.integers(count, size=count), minlength=count) for _ in range(DRAWS)]).astype(
-        np.float64
+def estimate(value: float, without: AnyFloats, effective: float, *, is_share: bool = False) -> ObjectEstimate:
+    """Return a value with its interval from the values without each object (object,); NaN becomes null.
+
+    ``effective`` is the effective number of objects. A share, such as an area, is transformed to log odds, because
+    its distribution is skewed near 0 and 1. There is no interval if no object changes the value.
+    """
+    values, mean = (_log_odds(without), _log_odds(value)) if is_share else (without, np.asarray(value))
+    influence = values.mean() - values
+    error = np.sqrt((len(values) - 1) / max(len(values), 1) * np.square(influence).sum())
+    freedom = effective - 1 if effective >= MIN_INTERVAL_CLUSTERS else np.nan
+    ends = (
+        Jackknife(np.atleast_1d(mean), np.atleast_1d(error), np.array([freedom]), influence[:, None]).interval().first
     )
+    low, high = (ends.low, ends.high) if error > ROUNDING else (np.nan, np.nan)
+    if is_share:
+        low, high = (float(1 / (1 + np.exp(-end))) for end in (low, high))
+    return _rounded(value, low, high)
 
 
-def estimate(value: float, draws: AnyFloats) -> ObjectEstimate:
-    """Return a value with the interval of its draws (draw,); NaN becomes null."""
-    finite = draws[np.isfinite(draws)]
-    low, high = np.quantile(finite, INTERVAL) if len(finite) >= DRAWS // 2 else (np.nan, np.nan)
-    numbers = (value, float(low), float(high))
-    texts = [float(f"{number:.6g}") if np.isfinite(number) else None for number in numbers]
+def share_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
+    """Return the share of ``flags`` (item,) with its interval over ``count`` objects; ``owners`` (item,) are indices."""
+    sums = np.stack([np.bincount(owners, part, count) for part in (flags, np.ones(len(flags)))])[:, :, None]
+    with_items = sums[1, :, 0] > 0
+    ends = share_interval(sums[0, with_items], sums[1, with_items]).first
+    is_certain = ends.low == ends.high
+    return _rounded(ends.mean, *((np.nan, np.nan) if is_certain else (ends.low, ends.high)))
+
+
+def _log_odds(share: AnyFloats | float) -> Floats:
+    limited = np.clip(share, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
+    odds: Floats = np.log(limited / (1 - limited))
+    return odds
+
+
+def _rounded(value: float, low: float, high: float) -> ObjectEstimate:
+    texts = [float(f"{number:.6g}") if np.isfinite(number) else None for number in (value, low, high)]
     return {"value": texts[0], "low": texts[1], "high": texts[2]}
 
 
-def areas(windows: WindowScores, draws: Floats) -> dict[str, ObjectEstimate]:
-    """Return the area under the curve of each part, with intervals over objects from ``draws`` (draw, object)."""
+def areas(windows: WindowScores) -> dict[str, ObjectEstimate]:
+    """Return the area under the curve of each part, with intervals over objects."""
     by_part = {name: windows.area(name) for name in PARTS}
-    return {name: estimate(area.value, area.drawn(draws)) for name, area in by_part.items()}
+    return {name: estimate(area.value, area.without, area.effective, is_share=True) for name, area in by_part.items()}
 
 
-def margin(model: WindowScores, baseline: WindowScores, draws: Floats, name: str = "before") -> ObjectEstimate:
+def margin(model: WindowScores, baseline: WindowScores, name: str = "before") -> ObjectEstimate:
     """Return by how much the area of a model exceeds that of a baseline, with its interval over the same objects."""
     first, second = model.area(name), baseline.area(name)
-    return estimate(first.value - second.value, first.drawn(draws) - second.drawn(draws))
+    return estimate(first.value - second.value, first.without - second.without, first.effective)
 
 
 def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:
@@ -195,17 +234,13 @@ def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:
     return float((weights * np.square(probabilities - slips)).sum() / total) if total else float("nan")
 
 
-def accuracy(probabilities: AnyFloats, windows: WindowScores, draws: Floats) -> ObjectEstimate:
+def accuracy(probabilities: AnyFloats, windows: WindowScores) -> ObjectEstimate:
     """Return the fraction of windows whose slip is stated with a probability on the right side of one half."""
     right = (probabilities >= 0.5) == (windows.states > STABLE)
-    sums = np.stack([np.bincount(windows.objects, part, windows.object_count) for part in (right, np.ones(len(right)))])
-    drawn = draws @ sums.T  # (draw, right or all)
-    return estimate(float(right.mean()) if len(right) else float("nan"), drawn[:, 0] / np.maximum(drawn[:, 1], 1))
+    return share_estimate(right, windows.objects, windows.object_count)
 
 
-def score_alarm(
-    tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | float, horizon_ns: int, draws: Floats
-) -> SlipAlarmScore:
+def score_alarm(tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | float, horizon_ns: int) -> SlipAlarmScore:
     """Return the score of an alarm; ``levels`` are one for all recordings or one by recording name."""
     events: list[EventScore] = []
     false = 0
@@ -219,13 +254,6 @@ def score_alarm(
     detected = np.array([event.to_end_ms == event.to_end_ms for event in events], bool)
     owners = np.array([names.index(event.object) for event in events], np.intp)
 
-    def ratio(flags: Bools) -> ObjectEstimate:
-        if not len(flags):
-            return estimate(float("nan"), np.zeros(0))
-        with np.errstate(invalid="ignore"):
-            drawn = np.array([np.divide((draw[owners] * flags).sum(), draw[owners].sum()) for draw in draws])
-        return estimate(float(flags.mean()), drawn)
-
     return {
         "events": len(events),
         "predicted": int(predicted.sum()),
@@ -235,8 +263,8 @@ def score_alarm(
         "false_alarms": false,
         "minutes": float(f"{minutes:.6g}"),
         "false_alarms_per_minute": float(f"{false / minutes:.6g}") if minutes else None,
-        "predicted_ratio": ratio(predicted),
-        "detected_ratio": ratio(detected),
+        "predicted_ratio": share_estimate(predicted, owners, len(names)),
+        "detected_ratio": share_estimate(detected, owners, len(names)),
     }
 
 

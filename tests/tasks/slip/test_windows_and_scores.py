@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -124,7 +125,47 @@ def test_the_area_under_the_curve_is_that_of_scikit_learn_for_any_draw_of_object
         roc_auc_score(windows.states > 0, windows.scores, sample_weight=windows.weights * draw[windows.objects])
         for draw in draws
     ]
-    assert windows.area("before").drawn(draws) == pytest.approx(expected)
+    assert windows.area("before").selected(draws) == pytest.approx(expected)
+
+
+def objects_with_slips(count: int, seed: int = 0) -> metrics.WindowScores:
+    """Return windows of objects, half of them before a slip."""
+    rng = np.random.default_rng(seed)
+    tracks = []
+    for number in range(count):
+        states = np.repeat([BEFORE, STABLE], 10)
+        scores = rng.standard_normal() + rng.standard_normal(20) + (states == BEFORE)
+        tracks.append(dataclasses.replace(scored(scores, states), name=str(number), object=str(number)))
+    return metrics.WindowScores(tracks)
+
+
+def test_the_interval_of_an_area_is_students_over_areas_without_one_object_each() -> None:
+    windows, other = objects_with_slips(9), objects_with_slips(9, 1)
+
+    def without(windows: metrics.WindowScores, number: int) -> float:
+        rest = windows.objects != number
+        return float(roc_auc_score(windows.states[rest] > 0, windows.scores[rest]))
+
+    areas, others = (np.array([without(part, number) for number in range(9)]) for part in (windows, other))
+    odds, value = np.log(areas / (1 - areas)), windows.area("before").value
+    width = scipy.stats.t.ppf(0.975, 8) * np.sqrt(8 / 9 * np.square(odds - odds.mean()).sum())
+    ends = [1 / (1 + np.exp(-(np.log(value / (1 - value)) + sign * width))) for sign in (-1, 1)]
+    estimate = metrics.areas(windows)["before"]
+    assert [estimate["value"], estimate["low"], estimate["high"]] == pytest.approx([value, *ends], rel=1e-5)
+    difference = areas - others
+    width = scipy.stats.t.ppf(0.975, 8) * np.sqrt(8 / 9 * np.square(difference - difference.mean()).sum())
+    margin = metrics.margin(windows, other)
+    assert margin["value"] is not None and margin["high"] is not None
+    assert margin["high"] - margin["value"] == pytest.approx(width, rel=1e-4)
+
+
+def test_values_that_no_object_changes_and_those_of_two_objects_have_no_interval() -> None:
+    windows = objects_with_slips(9)
+    windows.scores[:] = 0.0
+    assert metrics.areas(windows)["before"] == {"value": 0.5, "low": None, "high": None}
+    assert metrics.areas(objects_with_slips(2))["before"]["low"] is None
+    no_slip = metrics.share_estimate(np.zeros(0, bool), np.zeros(0, np.intp), 3)
+    assert no_slip == {"value": None, "low": None, "high": None}
 
 
 @settings(max_examples=60, deadline=None)
