@@ -65,6 +65,13 @@ def test_a_rate_over_slides_holds_for_the_same_materials_and_not_for_new_ones(ro
     assert by_count["40"][1] < 0.8 and 0.9 <= by_count["40"][2] <= 0.97
 
 
+def test_intervals_of_areas_over_objects_hold_the_truth_in_91_to_98_of_100_cases(rows: list[list[str]]) -> None:
+    by_case = {tuple(row[:2]): tuple(map(number, row[2:])) for row in rows if len(row) == 5 and row[0] != "objects"}
+    assert len(by_case) == 16
+    assert all(0.905 < share < 0.985 for _, *shares in by_case.values() for share in shares)
+    assert min(percentile for percentile, *_ in by_case.values()) < 0.7
+
+
 def test_the_page_holds_the_tables_that_the_command_prints(rows: list[list[str]]) -> None:
     for printed, stated_row in zip(rows, tables_of_page(), strict=True):
         for cell, page_cell in zip(printed, stated_row, strict=True):  # Another machine rounds differently.

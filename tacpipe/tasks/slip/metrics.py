@@ -196,8 +196,8 @@ def estimate(value: float, without: AnyFloats, effective: float, *, is_share: bo
     return _rounded(value, low, high)
 
 
-def share_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
-    """Return the share of ``flags`` (item,) with its interval over ``count`` objects; ``owners`` (item,) are indices."""
+def ratio_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
+    """Return the fraction of ``flags`` (item,) with its interval over ``count`` objects; ``owners`` (item,) are indices."""
     sums = np.stack([np.bincount(owners, part, count) for part in (flags, np.ones(len(flags)))])[:, :, None]
     with_items = sums[1, :, 0] > 0
     ends = share_interval(sums[0, with_items], sums[1, with_items]).first
@@ -237,7 +237,7 @@ def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:
 def accuracy(probabilities: AnyFloats, windows: WindowScores) -> ObjectEstimate:
     """Return the fraction of windows whose slip is stated with a probability on the right side of one half."""
     right = (probabilities >= 0.5) == (windows.states > STABLE)
-    return share_estimate(right, windows.objects, windows.object_count)
+    return ratio_estimate(right, windows.objects, windows.object_count)
 
 
 def score_alarm(tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | float, horizon_ns: int) -> SlipAlarmScore:
@@ -263,8 +263,8 @@ def score_alarm(tracks: Sequence[ScoredTrack], levels: Mapping[str, float] | flo
         "false_alarms": false,
         "minutes": float(f"{minutes:.6g}"),
         "false_alarms_per_minute": float(f"{false / minutes:.6g}") if minutes else None,
-        "predicted_ratio": share_estimate(predicted, owners, len(names)),
-        "detected_ratio": share_estimate(detected, owners, len(names)),
+        "predicted_ratio": ratio_estimate(predicted, owners, len(names)),
+        "detected_ratio": ratio_estimate(detected, owners, len(names)),
     }
 
 

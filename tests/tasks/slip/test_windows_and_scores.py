@@ -164,7 +164,7 @@ def test_values_that_no_object_changes_and_those_of_two_objects_have_no_interval
     windows.scores[:] = 0.0
     assert metrics.areas(windows)["before"] == {"value": 0.5, "low": None, "high": None}
     assert metrics.areas(objects_with_slips(2))["before"]["low"] is None
-    no_slip = metrics.share_estimate(np.zeros(0, bool), np.zeros(0, np.intp), 3)
+    no_slip = metrics.ratio_estimate(np.zeros(0, bool), np.zeros(0, np.intp), 3)
     assert no_slip == {"value": None, "low": None, "high": None}
 
 
