@@ -98,7 +98,7 @@ def taxel_positions(fields: Sequence[pa.Field]) -> tuple[Floats, str]:
     Row and column numbers in the field metadata have precedence. XELA uSkin, BioTac, BioTac SP and RoboSkin are
     recognised by the numbers of their columns. Other taxels are placed row by row on a grid of unit pitch.
     """
-    metadata = [{key.decode(): value.decode() for key, value in (entry.metadata or {}).items()} for entry in fields]
+    metadata = [schema.field_metadata(entry) for entry in fields]
     if metadata and all(entry.get("row", "").isdigit() and entry.get("column", "").isdigit() for entry in metadata):
         return grid([int(entry["row"]) for entry in metadata], [int(entry["column"]) for entry in metadata]), "grid"
     layout = _sensor_layout(metadata)

@@ -152,6 +152,11 @@ def float_field(name: str, unit: str, quantity: str, component: str | None = Non
     return pa.field(name, pa.float64(), metadata=metadata)
 
 
+def field_metadata(field: pa.Field) -> dict[str, str]:
+    """Return the metadata of a field as text; empty if it has none."""
+    return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+
+
 def label_field(name: str) -> pa.Field:
     """Return an int8 field of a label: 0 or 1, or a small number."""
     import pyarrow as pa

@@ -182,7 +182,7 @@ def _open(dataset: Path) -> Dataset:
 
 
 def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
-    from tacpipe.traces.curves import field_metadata
+    from tacpipe.channels.schema import field_metadata
 
     about = {field.name: field_metadata(field) for field in schema}
     return [

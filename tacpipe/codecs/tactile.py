@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bools
+from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import gap_mask as gap_mask
 from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
@@ -27,19 +28,14 @@ if TYPE_CHECKING:
 LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes the position of a channel
 
 
-def metadata(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a column as strings; empty if it has none."""
-    return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-
-
 def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
     """Return the names of the columns with this ``quantity`` in their metadata, in the order of the table."""
-    return tuple(field.name for field in schema if metadata(field).get("quantity") == quantity)
+    return tuple(field.name for field in schema if field_metadata(field).get("quantity") == quantity)
 
 
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
     """Return stream, taxel and axis of each channel, if its metadata contains them."""
-    described = [metadata(schema.field(name)) for name in channels]
+    described = [field_metadata(schema.field(name)) for name in channels]
     return [
         {key: metadata_of_channel[key] for key in LAYOUT if key in metadata_of_channel}
         for metadata_of_channel in described
@@ -53,7 +49,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
     """
     levels = []
     for name in channels:
-        level = metadata(schema.field(name)).get("rest")
+        level = field_metadata(schema.field(name)).get("rest")
         if level is None:
             raise TacpipeError(
                 f"Channel {name} has no rest level, so its counts cannot be distinguished from its load. "

@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from tacpipe.channels import streams
+from tacpipe.channels import schema, streams
 from tacpipe.printable import plain
 
 if TYPE_CHECKING:
@@ -261,8 +261,7 @@ def contents_from_parts(parts: Dataset) -> Contents:
 
 def field_metadata(field: pa.Field) -> dict[str, str]:
     """Return the metadata of a field as text, without those that Parquet adds."""
-    metadata = field.metadata or {}
-    return {key.decode(): value.decode() for key, value in metadata.items() if not key.startswith(b"PARQUET:")}
+    return {key: value for key, value in schema.field_metadata(field).items() if not key.startswith("PARQUET:")}
 
 
 def _columns_by_stream(rows: Iterable[ColumnRow]) -> dict[str, tuple[Column, ...]]:

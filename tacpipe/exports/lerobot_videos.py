@@ -112,6 +112,38 @@ def find_cameras(originals: Dataset) -> tuple[list[VideoFeature], list[tuple[str
     return cameras, losses
 
 
+def nearest_rows(columns: Columns, synchronized: Columns) -> Int64s:
+    """Return the row of the nearest frame of a stream for each row of the ``synchronized`` recording."""
+    t_ns = columns.column(TIME).to_numpy()
+    grid_ns = synchronized.column(TIME).to_numpy()
+    after = np.clip(np.searchsorted(t_ns, grid_ns), 1, max(1, len(t_ns) - 1))
+    later = np.minimum(after, len(t_ns) - 1)
+    is_later = np.abs(t_ns[later] - grid_ns) < np.abs(t_ns[after - 1] - grid_ns)
+    rows: Int64s = np.where(is_later, later, after - 1).astype(np.int64)
+    return rows
+
+
+def images_of_rows(columns: Columns, rows: Int64s) -> Iterator[Bytes]:
+    """Yield the image of each of the ascending ``rows``; a row without an image has the last one, or a black one."""
+    from tacpipe.video.decoding import decode_frames, read_batches
+
+    video_format = VideoFormat.from_metadata(columns.schema.field(PACKET).metadata)
+    start, _ = cut_rows(*_clocks(columns), int(rows[0]), int(rows[0]) + 1)
+    frames = decode_frames(video_format, read_batches(columns, start))
+    latest: Bytes = np.zeros((video_format.height_px, video_format.width_px, 3), np.uint8)
+    following = next(frames, None)
+    for row in rows.tolist():
+        while following is not None and start + following[0] <= row:
+            latest = following[1]
+            following = next(frames, None)
+        yield latest
+
+
+def _clocks(columns: Columns) -> tuple[Int64s, Any]:
+    clocks = columns.read([DTS, KEY_FRAME])
+    return clocks.column(DTS).to_numpy(), clocks.column(KEY_FRAME).to_numpy(zero_copy_only=False)
+
+
 @dataclass(frozen=True)
 class EpisodeVideo:
     """The video of a camera in one episode: the stream's row for each frame of the dataset."""
@@ -128,14 +160,8 @@ class EpisodeVideo:
     ) -> EpisodeVideo:
         """Return the video with the nearest frame to each row of the ``synchronized`` recording."""
         columns = original.columns(camera.stream)
-        video_format = read_format(columns)
-        assert video_format is not None
-        t_ns = columns.column(TIME).to_numpy()
-        grid_ns = synchronized.column(TIME).to_numpy()
-        after = np.clip(np.searchsorted(t_ns, grid_ns), 1, max(1, len(t_ns) - 1))
-        later = np.minimum(after, len(t_ns) - 1)
-        is_later = np.abs(t_ns[later] - grid_ns) < np.abs(t_ns[after - 1] - grid_ns)
-        return cls(columns, video_format, np.where(is_later, later, after - 1).astype(np.int64), codec, fps)
+        video_format = VideoFormat.from_metadata(columns.schema.field(PACKET).metadata)
+        return cls(columns, video_format, nearest_rows(columns, synchronized), codec, fps)
 
     @cached_property
     def is_copied(self) -> bool:
@@ -143,7 +169,7 @@ class EpisodeVideo:
         if self.video_format.codec != self.codec or not len(self.rows) or (np.diff(self.rows) != 1).any():
             return False
         start, stop = int(self.rows[0]), int(self.rows[-1]) + 1
-        dts, key_frame = self._clocks()
+        dts, key_frame = _clocks(self.columns)
         if not key_frame[start] or cut_rows(dts, key_frame, start, stop) != (start, stop):
             return False
         packets = (batch.column(PACKET) for batch in self.columns.batches([PACKET], BATCH_ROWS))
@@ -198,29 +224,11 @@ class EpisodeVideo:
         stream.pix_fmt = PIXELS
         stream.codec_context.time_base = Fraction(1, TICKS)
         stream.codec_context.thread_count = 1  # the bytes do not depend on the number of cores
-        for number, image in enumerate(self.images()):
+        for number, image in enumerate(images_of_rows(self.columns, self.rows)):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = self._tick(number), Fraction(1, TICKS)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-
-    def images(self) -> Iterator[Bytes]:
-        """Yield the image of each row of the dataset; a row without an image has the last one, or a black one."""
-        from tacpipe.video.decoding import decode_frames, read_batches
-
-        start, _ = cut_rows(*self._clocks(), int(self.rows[0]), int(self.rows[0]) + 1)
-        frames = decode_frames(self.video_format, read_batches(self.columns, start))
-        latest: Bytes = np.zeros((self.video_format.height_px, self.video_format.width_px, 3), np.uint8)
-        following = next(frames, None)
-        for row in self.rows.tolist():
-            while following is not None and start + following[0] <= row:
-                latest = following[1]
-                following = next(frames, None)
-            yield latest
-
-    def _clocks(self) -> tuple[Int64s, Any]:
-        clocks = self.columns.read([DTS, KEY_FRAME])
-        return clocks.column(DTS).to_numpy(), clocks.column(KEY_FRAME).to_numpy(zero_copy_only=False)
 
     def _tick(self, number: int) -> int:
         """Return the time of a frame of the dataset, rounded to `TICKS`."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.exports import contents
 from tacpipe.exports.contents import Loss
 from tacpipe.exports.files import README_NAME, Content, Files, Scratch, loss_notes, readme_text
-from tacpipe.exports.lerobot_videos import EpisodeVideo, find_cameras
+from tacpipe.exports.lerobot_videos import find_cameras, images_of_rows, nearest_rows
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
@@ -130,7 +130,8 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
         table = frames.synchronized_columns(recording).select(columns)
         for camera, writer in zip(cameras, image_writers, strict=True):
             original, grid = originals[recording.name], frames.synchronized_columns(recording)
-            for image in EpisodeVideo.from_recordings(camera, original, grid, "h264", rate_hz).images():
+            frame_columns = original.columns(camera.stream)
+            for image in images_of_rows(frame_columns, nearest_rows(frame_columns, grid)):
                 writer.append(image[None])
         for array, writer in zip(frame_arrays, writers, strict=True):
             for values in array.blocks(table, writer.kind):

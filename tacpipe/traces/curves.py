@@ -11,6 +11,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import arm
 from tacpipe.channels.arm import METRES, ORIENTATION, POSITION
+from tacpipe.channels.schema import field_metadata
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,11 +69,6 @@ def curves_of_table(stream: str, table: pa.Table) -> list[Curves]:
         else:
             curves.append(Curves(stream, quantity, unit, short_names(fields), t_ns, values))
     return curves
-
-
-def field_metadata(field: pa.Field) -> dict[str, str]:
-    """Return the metadata of a field as strings."""
-    return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
 
 
 def matrix(table: pa.Table, names: Sequence[str]) -> Floats:

@@ -10,8 +10,9 @@ import numpy as np
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
+from tacpipe.channels.schema import field_metadata
 from tacpipe.signals.resampling import linear
-from tacpipe.traces.curves import TIME, field_metadata, matrix
+from tacpipe.traces.curves import TIME, matrix
 from tacpipe.traces.taxels import Taxels
 
 if TYPE_CHECKING:

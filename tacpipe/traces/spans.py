@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
+from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import GAP, gaps_before
-from tacpipe.traces.curves import TIME, field_metadata
+from tacpipe.traces.curves import TIME
 
 if TYPE_CHECKING:
     import pyarrow as pa

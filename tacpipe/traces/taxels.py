@@ -10,8 +10,9 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import arm, places
+from tacpipe.channels.schema import field_metadata
 from tacpipe.signals.contact import rest_level
-from tacpipe.traces.curves import TIME, field_metadata, matrix
+from tacpipe.traces.curves import TIME, matrix
 
 if TYPE_CHECKING:
     import pyarrow as pa

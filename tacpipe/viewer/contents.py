@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s, Floats, Times
+from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.intervals import all_intervals
@@ -21,7 +22,7 @@ from tacpipe.printable import plain
 from tacpipe.signals import contact
 from tacpipe.traces import curves, spans, taxels
 from tacpipe.traces import predictions as forecasts
-from tacpipe.traces.curves import TIME, Curves, Path, field_metadata
+from tacpipe.traces.curves import TIME, Curves, Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels

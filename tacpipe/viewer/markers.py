@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import Floats, Times
-from tacpipe.traces.curves import TIME, field_metadata
+from tacpipe.channels.schema import field_metadata
+from tacpipe.traces.curves import TIME
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.table import pattern
 from tacpipe.formats.table.layout import ColumnRule, StreamLayout
@@ -142,7 +143,7 @@ def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
     stem = "taxel" if tactile else column.name.rstrip("0123456789").rstrip("_")
     plain_name = f"{stem}{padded if tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
     name = pattern.fill_pattern(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
-    declared_metadata = {key.decode(): value.decode() for key, value in (column.field.metadata or {}).items()}
+    declared_metadata = field_metadata(column.field)
     retained = {key: value for key, value in declared_metadata.items() if key not in values}
     return pa.field(name, column.field.type, metadata={**retained, **about, **dict(rule.about)})
 
@@ -154,7 +155,7 @@ def _column_field(rule: ColumnRule, name: str, values: dict[str, str], declared:
     if declared is None:
         return pa.field(column_name, TYPES[rule.type or "float64"], metadata=about)
     kind = TYPES[rule.type] if rule.type else (declared.type if rule.scale == 1.0 else pa.float64())
-    declared_metadata = {key.decode(): value.decode() for key, value in (declared.metadata or {}).items()}
+    declared_metadata = field_metadata(declared)
     return pa.field(column_name, kind, metadata={**declared_metadata, **about})
 
 

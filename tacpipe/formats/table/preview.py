@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tacpipe.arrays import Int64s
+from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.container import (
     EpisodeContents,
@@ -140,7 +141,7 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
     usual_ns = steps.median_ns()
     columns = {}
     for field in _measured_fields(rows.schema):
-        about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        about = field_metadata(field)
         kind = TYPE_NAMES.get(field.type, str(field.type))
         lowest, highest = ends.get(field.name) or (math.nan, math.nan)
         columns[field.name] = about.get("quantity", ""), about.get("unit", ""), kind, lowest, highest
@@ -312,7 +313,7 @@ def _column_rules(fields: Sequence[pa.Field]) -> list[str]:
     fields = [field for field in fields if not set("{}*") & set(field.name)]  # such names keep their declaration
     alike: dict[tuple[str, str, str, str], list[str]] = {}
     for field in fields:
-        about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        about = field_metadata(field)
         declared = (about.get("quantity", ""), about.get("unit", ""), TYPE_NAMES.get(field.type, ""))
         alike.setdefault((re.sub(r"\d+", "*", field.name), *declared), []).append(field.name)
     patterns = {

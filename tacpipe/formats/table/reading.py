@@ -183,7 +183,7 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     is_other_clock = stamped is not None and stream.time.column != source.time.column
     is_number = stamped is not None and (pa.types.is_integer(stamped.type) or pa.types.is_floating(stamped.type))
     file = ContainedRows(path, source, stream.time.column if is_other_clock and is_number else "")
-    about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
+    about = schema.field_metadata(stamped) if stamped else {}
     time_metadata = {key: value for key, value in about.items() if key not in ("unit", "quantity")}
     reader = _batches(file, stream, None, declared, time_metadata)
     table_or_reader = reader.read_all() if isinstance(source.content, pa.Table) else reader
@@ -243,7 +243,7 @@ def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
         field = schema.time_field("from the start of the recording")
     else:
         field = schema.time_field()
-    return field.with_metadata({**{key.decode(): value.decode() for key, value in field.metadata.items()}, **about})
+    return field.with_metadata(schema.field_metadata(field) | dict(about))
 
 
 def _check_stamps(

@@ -12,6 +12,7 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.channels import arm as poses
 from tacpipe.channels import streams
 from tacpipe.channels.arm import Pose
+from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import missing_channel_error
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
@@ -368,12 +369,12 @@ def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, .
         return names if set(names[0] + names[1]) <= set(schema.names) else ((), ())
     if not pose.position:
         return (), ()
-    stream = tactile.metadata(schema.field(pose.position[0])).get("stream")
+    stream = field_metadata(schema.field(pose.position[0])).get("stream")
     angles, speeds = (
         tuple(
             name
             for name in tactile.columns(schema, quantity)
-            if tactile.metadata(schema.field(name)).get("stream") == stream
+            if field_metadata(schema.field(name)).get("stream") == stream
         )
         for quantity in ("joint_position", "joint_velocity")
     )

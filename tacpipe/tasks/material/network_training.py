@@ -97,10 +97,10 @@ def train_network(
     held_out_materials = slides_of.held_out_materials(
         params.hold_out, config["classes"], training_slides, Naming.from_json(config)
     )
-    if start:
-        _require_same_space(start, mapped_to, config, training_slides)
+    frozen = _frozen_network(start, mapped_to, config, training_slides) if start else None
+    if start and frozen:
         shapes[mapped_to] = AutoencoderShape(**start.config["shapes"][mapped_to])
-        scalings[mapped_to] = _reader(start, mapped_to).scaling
+        scalings[mapped_to] = frozen.scaling
         config["trained_on"] = recordings.add_earlier(config["trained_on"], start.config["trained_on"])
     training, validation = (
         {
@@ -116,7 +116,7 @@ def train_network(
     work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
-        networks = _build_networks(params, shapes, start, mapped_to).to(device)
+        networks = _build_networks(params, shapes, frozen, mapped_to).to(device)
         for name, network in networks.items():
             estimators.check_network(network, params, training[name].frames, shapes[name].classes)
         return networks
@@ -228,11 +228,15 @@ def _require_same_materials(training_slides: BySensor, naming: Naming) -> None:
             )
 
 
-def _require_same_space(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> None:
-    """Raise an error if the --init model lacks the frozen sensor or has other materials."""
+def _frozen_network(start: Classifier, frozen_sensor: str, config: MaterialConfig, slides: BySensor) -> NetworkReader:
+    """Return the network of the frozen sensor in the --init model.
+
+    Raises `TacpipeError` if the model lacks the sensor or has other materials, and `UsageError` if the recordings lack it.
+    """
     if frozen_sensor not in slides:
         raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
-    if not start.params.ALIGNS_SENSORS:
+    networks = {name: reader for name, reader in start.readers.items() if isinstance(reader, NetworkReader)}
+    if not start.params.ALIGNS_SENSORS or not networks:
         raise TacpipeError(
             f"The model of --init is of the architecture {start.architecture}; its space must be of "
             f"{' or '.join(aligning_architectures())}."
@@ -243,29 +247,23 @@ def _require_same_space(start: Classifier, frozen_sensor: str, config: MaterialC
             f"The model of --init names {listed(map(start.naming.name, start.classes))} and the recordings have "
             f"{listed(map(Naming.from_json(config).name, config['classes']))}; a known space is that of the same ones."
         )
-
-
-def _reader(start: Classifier, sensor: str) -> NetworkReader:
-    reader = start.readers[sensor]
-    assert isinstance(reader, NetworkReader)
-    return reader
+    return networks[frozen_sensor]
 
 
 def _build_networks(
-    params: NetworkParams, shapes: Mapping[str, AutoencoderShape], start: Classifier | None, frozen: str
+    params: NetworkParams, shapes: Mapping[str, AutoencoderShape], frozen: NetworkReader | None, frozen_sensor: str
 ) -> nn.ModuleDict:
-    """Return the networks by sensor; that of ``frozen`` is copied and frozen, and all others use its classifier."""
+    """Return the networks by sensor; ``frozen`` is copied to its sensor and frozen, and all others use its classifier."""
     networks = nn.ModuleDict(
         {name: cast(nn.Module, estimators.build_network(params, shape)) for name, shape in shapes.items()}
     )
-    if start:
-        frozen_network = _reader(start, frozen).network
+    if frozen:
         for name, network in networks.items():
-            if name == frozen:
-                network.load_state_dict(frozen_network.state_dict())
+            if name == frozen_sensor:
+                network.load_state_dict(frozen.network.state_dict())
                 network.requires_grad_(False)
             else:
-                network.get_submodule("classifier").load_state_dict(frozen_network.classifier.state_dict())
+                network.get_submodule("classifier").load_state_dict(frozen.network.classifier.state_dict())
                 network.get_submodule("classifier").requires_grad_(False)
     return networks
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
+from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 
@@ -43,7 +44,7 @@ def score_forecasts(table: pa.Table) -> Floats:
     """Return the score of each row of a table of forecasts, by the metadata of its columns; 0 without shear."""
     places: dict[tuple[str, str, int], list[str]] = {}
     for field in table.schema:
-        about = tactile.metadata(field)
+        about = field_metadata(field)
         if about.get("quantity") == "prediction" and "axis" in about and "quantile" not in about:
             places.setdefault((about.get("stream", ""), about["axis"], int(about["step"])), []).append(field.name)
     steps = sorted({step for _, _, step in places})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
+from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.sensors.plan import NAME as PLAN
@@ -382,7 +383,7 @@ def _tactile_tables(recording: Recording, streams: str) -> Iterator[tuple[str, p
         schema = recording.columns(place).schema
         by_stream: dict[str, list[str]] = {}
         for name in tactile.columns(schema, "tactile"):
-            by_stream.setdefault(place or tactile.metadata(schema.field(name)).get("stream", ""), []).append(name)
+            by_stream.setdefault(place or field_metadata(schema.field(name)).get("stream", ""), []).append(name)
         for stream, names in by_stream.items():
             if not patterns or any(fnmatchcase(stream, pattern) for pattern in patterns):
                 has_any = True

@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
 from tacpipe.channels import arm as poses
-from tacpipe.channels.schema import time_field
+from tacpipe.channels.schema import field_metadata, time_field
 from tacpipe.channels.streams import EVENTS, count_axes
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
@@ -254,11 +254,11 @@ def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Sc
             stream = next((stream_name for stream_name in signals if name.startswith(f"{stream_name}_")), None)
             reason = f"its stream {stream} has no such channel" if stream else f"it records {listed(signals)}"
             raise TacpipeError(f"The model reads {name}, and this rig does not record it: {reason}.")
-    owners = {tactile.metadata(grid.field(name)).get("stream", "") for name in codec.channels}
+    owners = {field_metadata(grid.field(name)).get("stream", "") for name in codec.channels}
     tactile_columns = [
         name
         for name in tactile.columns(grid, "tactile")
-        if tactile.metadata(grid.field(name)).get("stream", "") in owners
+        if field_metadata(grid.field(name)).get("stream", "") in owners
     ]
     if sorted(tactile_columns) != sorted(codec.channels):
         extra = next((name for name in tactile_columns if name not in codec.channels), None)
