@@ -13,7 +13,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,7 +22,9 @@ import pytest
 from hypothesis import settings
 
 from tacpipe.cli import main
+from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Manifest, find
+from tacpipe.engine import provenance
 from tacpipe.plugins import architectures, registry
 from tacpipe.store.store import Store
 
@@ -106,6 +108,61 @@ def left_out(items: Sequence[int], part: str) -> set[int]:
 def pytest_xdist_auto_num_workers() -> int:
     """Return a worker more than there are cores: tests of recording wait for devices while others compute."""
     return (os.cpu_count() or 1) + 1
+
+
+@dataclass
+class FileCalls:
+    """The files that this process opened, and the names that it gave to files, since the last `clear`."""
+
+    opened: list[str] = field(default_factory=list)
+    named: list[str] = field(default_factory=list)
+
+    def clear(self) -> None:
+        """Forget the calls."""
+        self.opened.clear()
+        self.named.clear()
+
+    def take(self, folder: str) -> int:
+        """Return how many files in folders of this name were opened, and forget all calls."""
+        count = sum(folder in Path(path).parts for path in self.opened)
+        self.clear()
+        return count
+
+
+_traced: list[FileCalls] = []
+
+
+@pytest.fixture
+def file_calls() -> Iterator[FileCalls]:
+    """The calls of this process to open and rename files during the test."""
+    if not _traced:
+        sys.addaudithook(_trace)
+    _traced[:] = [FileCalls()]
+    yield _traced[0]
+    _traced[:] = [FileCalls()]
+
+
+def _trace(event: str, arguments: Sequence[Any]) -> None:
+    if event == "open" and isinstance(arguments[0], str):
+        _traced[0].opened.append(arguments[0])
+    elif event == "os.rename":
+        _traced[0].named.append(os.fspath(arguments[1]))
+
+
+@pytest.fixture
+def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All datasets of two recordings and more have pages, with two recordings in the mean, and none is remembered."""
+    monkeypatch.setattr(pages, "INLINE", 1)
+    monkeypatch.setattr(pages, "GROUPED", 2)
+    monkeypatch.setattr(manifest, "_parsed", {})
+
+
+@pytest.fixture
+def eight_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system lets this process use eight cores, and its environment states no number of threads or processes."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    for name in (*provenance.THREADS, provenance.JOBS):
+        monkeypatch.delenv(name, raising=False)
 
 
 @dataclass

@@ -2,51 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import tacpipe
-from tacpipe.datasets import directory, manifest, pages
+from tacpipe.datasets import manifest, pages
 from tacpipe.errors import DamagedError
-from tacpipe.store.records import Record, summary
+from tacpipe.store.records import summary
 from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import FileCalls, Lab
 
 GROUPED, COUNT = 4, 40
 
 
-@pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], dict[str, int]]]:
-    """A function that returns how often records were read and files were written into datasets, since it was called last."""
-    calls = {"records": 0, "placed": 0}
-    read, place = Store.read_record, directory.place
-
-    def reading(self: Store, key: str) -> Record:
-        calls["records"] += 1
-        return read(self, key)
-
-    def placing(*arguments: Any, **options: Any) -> None:
-        calls["placed"] += 1
-        place(*arguments, **options)
-
-    monkeypatch.setattr(Store, "read_record", reading)
-    monkeypatch.setattr(directory, "place", placing)
-    monkeypatch.setattr(pages, "GROUPED", GROUPED)
-
-    def take_counts() -> dict[str, int]:
-        counts = dict(calls)
-        calls.update(records=0, placed=0)
-        return counts
-
-    yield take_counts
+def placed_shards(file_calls: FileCalls) -> list[str]:
+    return [path for path in file_calls.named if "/data/" in path and path.endswith(".parquet")]
 
 
 def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_files(
-    lab: Lab, counted: Callable[[], dict[str, int]]
+    lab: Lab, file_calls: FileCalls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pages, "GROUPED", GROUPED)
     lab.run(f"simulate toy --rows 2 --trials {COUNT} -o data/toy")
     lab.run("scale data/toy -o data/scaled --jobs 1")
     names = list(tacpipe.open(lab.folder / "data/toy").recordings)
@@ -54,15 +31,15 @@ def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_fi
     assert max(sizes) < COUNT / 2
     before = {path: path.stat().st_ino for path in (lab.folder / "data/toy").rglob("*.parquet")}
 
-    counted()
+    file_calls.clear()
     lab.run(f"simulate toy --rows 2 --trials {COUNT + 1} -o data/toy --jobs 1")
-    assert counted()["placed"] == 2  # the streams of the new one
+    assert len(placed_shards(file_calls)) == 2  # the streams of the new one
     assert {path: path.stat().st_ino for path in before} == before
 
+    file_calls.clear()
     ran = lab.run("scale data/toy -o data/scaled --jobs 1 --json")
-    reads_and_writes = counted()
-    assert reads_and_writes["placed"] == 1
-    assert reads_and_writes["records"] < len(sizes) + 2 * (max(sizes) + 1) + 8 < COUNT
+    assert len(placed_shards(file_calls)) == 1
+    assert file_calls.take("records") < len(sizes) + 2 * (max(sizes) + 1) + 8 < COUNT
     assert f'"reused": {COUNT}' in ran.out and '"ran": 1,' in ran.out
 
 
@@ -85,8 +62,9 @@ def test_groups_hold_every_recording_and_the_results_are_those_without_groups(
 
 
 def test_a_lost_object_of_a_group_is_computed_again_and_nothing_else_is(
-    lab: Lab, counted: Callable[[], dict[str, int]]
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pages, "GROUPED", GROUPED)
     lab.run("simulate toy --rows 2 --trials 12 -o data/toy")
     lab.run("scale data/toy -o data/scaled --jobs 1")
     shard = tacpipe.open(lab.folder / "data/scaled").recordings["trial-005"].digest

@@ -1,10 +1,6 @@
 import os
-from typing import Any
 
-import pytest
-
-from tacpipe.store.store import Store
-from tests.conftest import Lab, write_source
+from tests.conftest import FileCalls, Lab, write_source
 
 
 def explain(lab: Lab, path: str) -> dict[str, object]:
@@ -60,21 +56,14 @@ def test_a_dataset_that_came_without_its_ancestors_is_explained_as_far_as_it_goe
 
 
 def test_explain_reads_the_record_of_the_dataset_and_not_those_of_its_recordings(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+    lab: Lab, file_calls: FileCalls
 ) -> None:
     lab.run("simulate toy --trials 30 --rows 3 -o data/r --jobs 1")
     lab.run("scale data/r -o data/s --jobs 1")
-    honest, read = Store.read_record, list[str]()
-
-    def count_read(store: Store, key: str) -> Any:
-        read.append(key)
-        return honest(store, key)
-
-    monkeypatch.setattr(Store, "read_record", count_read)
     for dataset in ("data/r", "data/s"):
-        read.clear()
+        file_calls.clear()
         assert explain(lab, dataset)["provenance"] is not None
-        assert len(read) == 1 < len(list(lab.store.root.glob("records/*/*"))) / 30
+        assert file_calls.take("records") == 1 < len(list(lab.store.root.glob("records/*/*"))) / 30
 
 
 def test_a_record_that_was_written_at_another_time_than_its_root_is_found_all_the_same(lab: Lab) -> None:

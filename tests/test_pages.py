@@ -75,14 +75,6 @@ def read_again(full_manifest: Manifest) -> tuple[Manifest, Objects]:
     return manifest.parse(full_manifest.content, "manifest", objects), objects
 
 
-@pytest.fixture
-def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All datasets of two recordings and more have pages, with two recordings in the mean."""
-    monkeypatch.setattr(pages, "INLINE", 1)
-    monkeypatch.setattr(pages, "GROUPED", 2)
-    monkeypatch.setattr(manifest, "_parsed", {})
-
-
 @contextmanager
 def divide_into_pages(grouped: int) -> Iterator[None]:
     """All datasets of two recordings and more have pages, with ``grouped`` recordings in the mean."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.datasets import directory, manifest, pages
+from tacpipe.datasets import directory
 from tacpipe.io.hashing import file_digest
 from tacpipe.maintenance.sound_records import NOTES
 from tacpipe.store import layout, presence
@@ -20,7 +20,7 @@ DAY_NS = 86_400 * 10**9
 
 
 @pytest.fixture
-def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
+def shows(few_are_many: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """The directories of which each file was looked at; all datasets are large, and all folders changed long ago."""
     shown_directories: list[Path] = []
     look, clock_ns = directory.showing, presence.Look._clock_ns
@@ -31,9 +31,6 @@ def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
 
     monkeypatch.setattr(directory, "showing", record_look)
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
-    monkeypatch.setattr(pages, "INLINE", 1)
-    monkeypatch.setattr(pages, "GROUPED", 2)
-    monkeypatch.setattr(manifest, "_parsed", {})
     yield shown_directories
 
 

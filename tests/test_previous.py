@@ -18,8 +18,7 @@ from tacpipe.engine.previous import Previous, Reusable
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
 from tacpipe.store import presence, records
-from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import FileCalls, Lab
 from tests.test_presence import DAY_NS, FAULTS
 
 NAMED = "named data/r -o data/s --jobs 1"
@@ -29,7 +28,7 @@ NOTES = ("a", 'say ": this', "é", "\\", "a\nb")
 
 
 @pytest.fixture
-def reused_counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+def reused_counts(few_are_many: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """How many results each command took over; all datasets are large, a group has two recordings in the mean."""
     counts: list[int] = []
     take = Previous.reusable
@@ -40,9 +39,6 @@ def reused_counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         return previous_results
 
     monkeypatch.setattr(Previous, "reusable", taking)
-    monkeypatch.setattr(pages, "INLINE", 1)
-    monkeypatch.setattr(pages, "GROUPED", 2)
-    monkeypatch.setattr(manifest, "_parsed", {})
     yield counts
 
 
@@ -135,7 +131,7 @@ def test_what_is_lost_is_found_by_the_run_that_takes_over_the_rest(
 
 
 def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for(
-    lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
+    lab: Lab, reused_counts: list[int], file_calls: FileCalls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pages, "GROUPED", 4)
     count = 60
@@ -143,14 +139,12 @@ def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for
     lab.run(NAMED)
     lab.run("label data/r trial-030 --set material=felt")
     sizes = [len(group) for group in pages.group_names(f"trial-{number:03d}" for number in range(count))]
-    keys: list[str] = []
-    read = Store.read_record
-    monkeypatch.setattr(Store, "read_record", lambda self, key: read(self, keys.append(key) or key))  # type: ignore[func-returns-value]
+    file_calls.clear()
     ran = lab.run_json(NAMED)
 
     assert (ran["ran"], ran["reused"]) == (1, count - 1)
     assert reused_counts[-1] >= count - max(sizes)
-    assert len(keys) < max(sizes) + 10 < count / 2
+    assert file_calls.take("records") < max(sizes) + 10 < count / 2
 
 
 def test_while_results_are_taken_over_a_collection_sees_the_manifests_that_name_them(

@@ -80,11 +80,8 @@ def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
 
 
 def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(
-    monkeypatch: pytest.MonkeyPatch,
+    eight_cores: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
-    for name in provenance.THREADS:
-        monkeypatch.delenv(name, raising=False)
     before = [{name: os.environ.get(name)} for name in provenance.THREADS]
     assert provenance.each_of(2) == dict.fromkeys(provenance.THREADS, "4")
     assert provenance.each_of(16) == dict.fromkeys(provenance.THREADS, "1")
@@ -97,10 +94,8 @@ def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environ
 
 
 def test_a_command_starts_as_many_processes_as_the_environment_states_else_one_a_core(
-    monkeypatch: pytest.MonkeyPatch,
+    eight_cores: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
-    monkeypatch.delenv(provenance.JOBS, raising=False)
     assert provenance.jobs() == 8
     assert [provenance.jobs_of(commands) for commands in (1, 3, 16)] == [{provenance.JOBS: n} for n in ("8", "2", "1")]
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from tacpipe.cli import stage_processes
-from tacpipe.engine import provenance
 from tests.conftest import Lab, tacpipe
 from tests.test_run import STAGES, content, stage_that_adds, write_chain
 
@@ -96,10 +95,7 @@ def test_with_nothing_to_do_no_process_is_started(lab: Lab, monkeypatch: pytest.
     assert lab.run("run dvc.yaml --jobs 0").err.splitlines()[-1] == "3 unchanged"
 
 
-def test_each_process_gets_its_part_of_the_cores(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
-    for name in provenance.THREADS:
-        monkeypatch.delenv(name, raising=False)
+def test_each_process_gets_its_part_of_the_cores(lab: Lab, eight_cores: None) -> None:
     write_chain({str(number): {"cmd": "echo $OMP_NUM_THREADS $OPENBLAS_NUM_THREADS >> threads"} for number in range(2)})
     lab.run("run dvc.yaml --jobs 2")
 
@@ -107,11 +103,7 @@ def test_each_process_gets_its_part_of_the_cores(lab: Lab, monkeypatch: pytest.M
     assert "OMP_NUM_THREADS" not in os.environ
 
 
-def test_commands_that_begin_together_share_the_cores_and_one_alone_has_them_all(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(provenance, "usable_cores", lambda: 8)
-    monkeypatch.delenv(provenance.JOBS, raising=False)
+def test_commands_that_begin_together_share_the_cores_and_one_alone_has_them_all(lab: Lab, eight_cores: None) -> None:
     stages = {name: {"cmd": f"echo $TACPIPE_JOBS > {name}"} for name in ("first", "second", "last")}
     stages["first"]["cmd"] = f"touch a && {WAITS.format('b', 'b')}; echo $TACPIPE_JOBS > first"
     stages["second"]["cmd"] = f"touch b && {WAITS.format('a', 'a')}; echo $TACPIPE_JOBS > second"

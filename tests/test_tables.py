@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import ast
 import errno
 import io
@@ -6,6 +8,7 @@ import re
 import tempfile
 import weakref
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import duckdb
@@ -19,6 +22,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DamagedError, StorageError
 from tacpipe.io import parquet, parquet_claims, row_groups
+from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import ParquetTable, from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
@@ -236,3 +240,78 @@ def test_a_table_that_is_read_from_its_file_is_the_one_of_its_bytes(table: pa.Ta
         stored = ParquetTable(Path(file.name))
         assert bits(stored.read(names)) == bits(table.select(names))
         assert bits(pa.concat_tables([table.slice(0, 0), *stored.batches(rows=7)])) == bits(table)
+
+
+@given(tables(), st.sampled_from([1, 100, 10_000, 1 << 26]), st.randoms(use_true_random=False))
+def test_each_column_is_that_of_the_table_whatever_the_order_and_the_size_of_a_block(
+    table: pa.Table, block_bytes: int, chance: Random
+) -> None:
+    content = to_parquet(table)
+    expected, columns = from_parquet(content), Columns(content, block_bytes)
+    assert columns.schema.equals(expected.schema, check_metadata=True)
+    assert (columns.num_rows, columns.column_names) == (expected.num_rows, expected.column_names)
+    names = chance.choices(expected.column_names, k=2 * expected.num_columns) if expected.num_columns else []
+    for name in names:
+        assert bits(pa.table({name: columns.column(name)})) == bits(pa.table({name: expected.column(name)}))
+
+
+def test_a_stream_that_is_larger_than_a_block_is_never_decoded_whole() -> None:
+    rows, names = 1000, [f"x{number}" for number in range(40)]
+    content = to_parquet(pa.table({name: pa.array(range(rows), pa.int32()) for name in names}))
+    columns = Columns(content, block_bytes=3 * 4 * rows)
+    before = pa.total_allocated_bytes()
+    for name in names:
+        assert columns.column(name).to_pylist() == list(range(rows))
+        assert pa.total_allocated_bytes() - before < 5 * 4 * rows
+
+
+def test_a_column_that_is_not_there_is_a_key_error() -> None:
+    with pytest.raises(KeyError):
+        Columns(to_parquet(pa.table({"x": pa.array([1], pa.int8())}))).column("y")
+
+
+def test_bytes_that_are_no_parquet_file_are_damage() -> None:
+    with pytest.raises(DamagedError):
+        Columns(b"PAR1 nothing of the kind PAR1")
+
+
+def table(frames: list[bytes]) -> pa.Table:
+    half = len(frames) // 2
+    data = pa.chunked_array([pa.array(frames[:half], pa.binary()), pa.array(frames[half:], pa.binary())])
+    return pa.table({"t_ns": pa.array(range(len(frames)), pa.int64()), "data": data})
+
+
+def noise(count: int, size: int) -> list[bytes]:
+    rng = np.random.default_rng(1)
+    return [rng.bytes(size + number) for number in range(count)]
+
+
+def compression(content: bytes) -> str:
+    return str(pq.ParquetFile(io.BytesIO(content)).metadata.row_group(0).column(1).compression)
+
+
+def test_frames_come_back_to_the_byte() -> None:
+    sent = table([b"", *noise(40, 3000), b"\0" * 7])
+    assert from_parquet(to_parquet(sent)).equals(sent)
+    assert to_parquet(sent) == to_parquet(sent)
+
+
+def test_what_is_compressed_already_is_not_compressed_again() -> None:
+    assert compression(to_parquet(table(noise(40, 3000)))) == "UNCOMPRESSED"
+    assert compression(to_parquet(table([bytes(5000)] * 40))) == "ZSTD"
+
+
+def test_pages_and_groups_of_rows_stay_small_whatever_a_frame_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "PAGE_BYTES", 10_000)
+    monkeypatch.setattr(parquet, "GROUP_BYTES", 100_000)
+    content = to_parquet(table(noise(60, 5000)))
+    metadata = pq.ParquetFile(io.BytesIO(content)).metadata
+    sizes = [metadata.row_group(number).column(1).total_uncompressed_size for number in range(metadata.num_row_groups)]
+    assert max(sizes) < 120_000
+    assert from_parquet(content).num_rows == 60
+
+
+def test_another_column_is_read_without_the_frames() -> None:
+    columns = Columns(to_parquet(table(noise(40, 3000))))
+    assert columns.column("t_ns").to_pylist() == list(range(40))
+    assert "data" not in columns._decoded.column_names

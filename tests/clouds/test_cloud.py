@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from tacpipe.clouds.cloud import COLOUR, POSITION, Cloud
+from tacpipe.clouds.cloud import COLOUR, POSITION, Cloud, normals
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import from_parquet, to_parquet
+from tests.clouds import shapes
 
 POINTS = arrays.arrays(
     np.float32,
@@ -69,3 +70,20 @@ def test_a_cloud_is_as_long_as_it_has_points() -> None:
 def test_what_is_no_cloud_is_refused(points: np.ndarray, colours: np.ndarray | None, sentence: str) -> None:
     with pytest.raises(TacpipeError, match=sentence):
         Cloud(points.astype(np.float32), colours)
+
+
+def test_normals_of_a_sphere_point_along_its_radius_and_towards_the_camera() -> None:
+    cloud = shapes.sphere(0.05)
+    unit_normals = normals(cloud, 0.008)
+    radial = (cloud.points_m - shapes.PLACE_M) / 0.05
+    towards = -(cloud.points_m * unit_normals).sum(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(unit_normals, axis=1), 1, atol=1e-9)
+    assert np.median(np.abs((unit_normals * radial).sum(axis=1))) > 0.999
+    assert (towards >= 0).all()
+
+
+def test_a_camera_elsewhere_turns_the_normals_towards_itself() -> None:
+    grid = np.stack(np.meshgrid(np.arange(12), np.arange(12)), axis=-1).reshape(-1, 2) * 0.003
+    plane = Cloud(np.column_stack([grid, np.full(len(grid), 1.0)]).astype(np.float32))
+    np.testing.assert_allclose(normals(plane), np.tile([0, 0, -1.0], (len(grid), 1)), atol=1e-6)
+    np.testing.assert_allclose(normals(plane, camera_m=(0, 0, 2)), np.tile([0, 0, 1.0], (len(grid), 1)), atol=1e-6)

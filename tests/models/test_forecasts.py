@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given as each
+from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import ChangeForecast, grid
-from tacpipe.models.forecasts import RecurrentForecast, build
+from tacpipe.models.forecasts import Ensemble, RecurrentForecast, RecurrentForward, Shrunk, build, persistence_weights
 from tacpipe.models.windows import ARM, POSE, ForecastWindows
 from tacpipe.plugins import registry
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
 
 ARCHITECTURES = registry.architectures("forward")
 CHANGE = [name for name in ARCHITECTURES if name != "recurrent"]
-
-
 SIZES: dict[str, Any] = {"hidden": 12, "dropout": 0.2, "loss": "absolute", "context": CONTEXT, "horizon": HORIZON}
 
 
@@ -231,3 +232,186 @@ def test_taxels_share_one_network_so_that_a_swap_of_their_traits_swaps_what_is_t
         traits.copy_(traits[[1, 0, 2, 3]])
     after = change(network, inputs._replace(touch=inputs.touch[..., order]))
     assert torch.allclose(after, before[..., order], atol=1e-2)
+
+
+def network(seed: int) -> nn.Module:
+    """A network that no longer begins at persistence."""
+    torch.manual_seed(seed)
+    sizes = {"hidden": 8, "dropout": 0.0, "loss": "absolute", "context": CONTEXT, "horizon": HORIZON}
+    member = build("gru", len(LAYOUT), LAYOUT, changes=False, **sizes)  # type: ignore[arg-type]
+    for weight in member.parameters():
+        nn.init.normal_(weight, std=0.3)
+    return member.eval()
+
+
+def calibrated(count: int) -> tuple[list[nn.Module], Ensemble, ForecastWindows]:
+    members, inputs = [network(seed) for seed in range(count)], windows(40)
+    ensemble = Ensemble(members)
+    ensemble.calibrate(inputs, ahead(inputs))
+    return members, ensemble.eval(), inputs
+
+
+@torch.no_grad()
+def test_the_forecast_of_an_ensemble_is_the_mean_of_its_members() -> None:
+    members, ensemble, inputs = calibrated(3)
+    expected = np.mean([member(inputs).numpy() for member in members], axis=0)
+    np.testing.assert_allclose(ensemble(inputs).numpy(), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_each_member_gets_the_gradient_that_it_would_get_alone() -> None:
+    members, ensemble, inputs = calibrated(2)
+    ensemble.loss(inputs, ahead(inputs)).backward()  # type: ignore[no-untyped-call]
+    ensemble_gradients = [weight.grad for weight in members[1].parameters()]
+    members[1].zero_grad()
+    members[1].loss(inputs, ahead(inputs)).backward()  # type: ignore[operator]
+    for weight, half in zip(members[1].parameters(), ensemble_gradients, strict=True):
+        if weight.grad is not None:
+            assert half is not None
+            torch.testing.assert_close(weight.grad / 2, half)
+
+
+@torch.no_grad()
+def test_a_shrunk_forecast_is_no_worse_than_persistence_at_any_step_of_the_windows_it_was_shrunk_on() -> None:
+    _, ensemble, inputs = calibrated(2)
+    truth = ahead(inputs)
+    errors = (ensemble(inputs) - truth).abs().mean((1, 2))
+    persistence = (inputs.touch[-1] - truth).abs().mean((1, 2))
+    assert (errors > persistence).any()  # these networks were not trained
+    now = inputs.touch[-1]
+    recording = torch.zeros(40, dtype=torch.int64)
+    shrunk = Shrunk(ensemble, persistence_weights(ensemble(inputs) - now, truth - now, recording))
+    assert ((shrunk(inputs) - truth).abs().mean((1, 2)) <= persistence * (1 + 1e-6)).all()
+
+
+@each(st.integers(0, 1000), st.integers(1, 5), st.floats(-3, 3, allow_nan=False))
+def test_weights_never_raise_the_mean_over_recordings_of_the_error_beside_persistence(
+    seed: int, recordings: int, gain: float
+) -> None:
+    generator = np.random.default_rng(seed)
+    scales = 10.0 ** generator.normal(size=(1, 6, 1))  # counts of windows: one large recording decides nothing
+    measured = torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
+    changes = gain * measured + torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
+    recording = torch.from_numpy(generator.integers(0, recordings, 6))
+    weights = persistence_weights(changes, measured, recording)
+    assert ((weights >= 0) & (weights <= 1)).all()
+    errors = (measured - weights.double()[:, None, None] * changes).abs().mean(2).numpy()  # (step, window)
+    persistence = measured.abs().mean(2).numpy()
+    for step in range(3):
+        ratios = [
+            errors[step, recording == number].mean() / persistence[step, recording == number].mean()
+            for number in torch.unique(recording)
+        ]
+        assert np.mean(ratios) <= 1 + 1e-9
+
+
+def test_a_small_gain_counts_the_more_the_more_recordings_show_it() -> None:
+    generator = torch.Generator().manual_seed(0)
+    changes = torch.randn(1, 400, 30, generator=generator)
+    measured = 0.05 * changes + torch.randn(1, 400, 30, generator=generator)
+    one_recording, forty_recordings = (
+        persistence_weights(changes, measured, torch.arange(400) % count) for count in (1, 40)
+    )
+    assert one_recording < forty_recordings
+    assert (
+        persistence_weights(measured, measured, torch.zeros(400)) == 1
+    )  # one recording of a perfect forecast shows enough
+
+
+def test_recordings_in_which_nothing_changes_decide_nothing() -> None:
+    measured = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
+    recording = torch.tensor([0, 0, 0, 1, 1, 1])
+    measured[:, 3:] = 0
+    changes = measured.clone()
+    assert persistence_weights(changes, measured, recording).tolist() == [1.0, 1.0]
+
+
+LATENTS, STATES, ROWS, STEPS, WINDOWS = 3, 2, 5, 4, 6
+
+
+def recurrent_model() -> RecurrentForward:
+    torch.manual_seed(0)
+    return RecurrentForward(LATENTS, STATES, hidden=8)
+
+
+def random_windows(seed: int = 1) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    past = torch.randn(ROWS, WINDOWS, LATENTS + STATES, generator=generator)
+    return past, torch.randn(STEPS, WINDOWS, STATES, generator=generator)
+
+
+def step_by_step(network: RecurrentForward, past: Tensor, plan: Tensor) -> Tensor:
+    """The paper's model as its text reads: cell by cell, each prediction fed back."""
+    cells = []
+    for layer in (network.encoder, network.decoder):
+        cell = nn.LSTMCell(LATENTS + STATES, network.hidden)
+        for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+            setattr(cell, name, getattr(layer, f"{name}_l0"))
+        cells.append(cell)
+    hidden = past.new_zeros(past.shape[1], network.hidden), past.new_zeros(past.shape[1], network.hidden)
+    for frame in past:
+        hidden = cells[0](frame, hidden)
+    predicted, steps = past[-1, :, :LATENTS], []
+    for planned in plan:
+        hidden = cells[1](torch.cat([predicted, planned], dim=1), hidden)
+        predicted = network.head(hidden[0])
+        steps.append(predicted)
+    return torch.stack(steps)
+
+
+def test_predictions_and_gradients_are_those_of_a_loop_over_cells() -> None:
+    network, (past, plan) = recurrent_model(), random_windows()
+    fast, slow = network(past, plan), step_by_step(network, past, plan)
+    assert torch.allclose(fast, slow, atol=1e-6)
+    weights = list(network.parameters())
+    for ours, theirs in zip(
+        torch.autograd.grad(fast.square().mean(), weights),
+        torch.autograd.grad(slow.square().mean(), weights),
+        strict=True,
+    ):
+        assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+def test_all_weights_learn_those_of_the_encoder_too() -> None:
+    network, (past, plan) = recurrent_model(), random_windows()
+    network(past, plan)[-1].square().mean().backward()
+    for name, weight in network.named_parameters():
+        assert weight.grad is not None, name
+        assert weight.grad.abs().max() > 0, name
+
+
+def test_a_prediction_does_not_know_the_plan_of_later_steps() -> None:
+    network, (past, plan) = recurrent_model(), random_windows()
+    before = network(past, plan)
+    for step in range(STEPS):
+        changed = plan.clone()
+        changed[step] += 1
+        after = network(past, changed)
+        assert torch.equal(after[:step], before[:step])
+        assert (after[step:] != before[step:]).all()
+
+
+def test_windows_of_a_batch_do_not_see_each_other_in_a_recurrent_network() -> None:
+    network, (past, plan) = recurrent_model(), random_windows()
+    before, changed = network(past, plan), past.clone()
+    changed[:, 0] += 1
+    after = network(changed, plan)
+    assert torch.allclose(after[:, 1:], before[:, 1:], atol=1e-6)
+    assert not torch.allclose(after[:, 0], before[:, 0], atol=1e-3)
+
+
+def test_a_horizon_of_one_step_works() -> None:
+    past, plan = random_windows()
+    assert np.shape(recurrent_model()(past, plan[:1])) == (1, WINDOWS, LATENTS)
+
+
+def test_without_gradients_predictions_are_the_same() -> None:
+    network, (past, plan) = recurrent_model(), random_windows()
+    with torch.no_grad():
+        plain = network(past, plan)
+    assert torch.allclose(network(past, plan), plain, atol=1e-6)
+
+
+def test_names_of_the_weights_are_those_of_stored_models() -> None:
+    lstm = [f"{name}_l0" for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+    expected = [f"{layer}.{name}" for layer in ("encoder", "decoder") for name in lstm] + ["head.weight", "head.bias"]
+    assert list(recurrent_model().state_dict()) == expected

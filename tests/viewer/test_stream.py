@@ -18,7 +18,7 @@ from tacpipe.traces import drawing, taxels
 from tacpipe.viewer import contents, session
 from tacpipe.viewer.markers import MarkerTrack
 from tests.conftest import Lab
-from tests.traces.test_forecasts import predictions
+from tests.traces.test_predictions import predictions
 from tests.viewer import hand
 
 pytestmark = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,17 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from torch import nn
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.models.windows import ARM, ForecastWindows
 from tacpipe.plugins.registry import load as load_stage
 from tacpipe.plugins.stage import Source
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.networks import Network
 from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.conftest import sample_data
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
+from tests.live import rigs
 from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 from tests.tasks.forward.trials import (
     CONTEXT,
@@ -276,3 +283,63 @@ def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
         loaded.predict(*asked(recorded, starts)), windows_predicted.predictions["model"].count, atol=0.05
     )
     assert recorded.arm[0, 7:].any()
+
+
+@pytest.fixture(scope="module")
+def traced(tmp_path_factory: pytest.TempPathFactory) -> Forecaster:
+    model_files = rigs.model(tmp_path_factory.mktemp("model"))
+    return Forecaster.load(model_files[0])
+
+
+def arm_windows(traced: Forecaster, seed: int) -> ForecastWindows:
+    rng = np.random.default_rng(seed)
+    context, rows = traced.context, traced.context + traced.horizon
+    touch = rng.normal(0, 50, (context, 1, len(traced.codec.latents))).cumsum(axis=0)
+    arm = rng.normal(0, 0.01, (rows, 1, ARM))
+    arm[..., 6] = 1
+    parts = (touch, arm, rng.normal(0.04, 0.01, (context, 1)))
+    return ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in parts))
+
+
+def test_a_recorded_network_gives_what_the_network_gives_to_the_last_bit(traced: Forecaster) -> None:
+    network = Network(traced)
+    assert network.is_recorded
+    for seed in range(20):
+        inputs = arm_windows(traced, seed)
+        assert network.features(inputs).tobytes() == traced.features(inputs).tobytes()
+
+
+class Moody(nn.Module):
+    """Takes another way for windows that a recording of one window does not show."""
+
+    change_only = True
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, inputs: ForecastWindows) -> Any:
+        predicted = self.network(inputs)
+        return predicted + 1 if float(inputs.touch.abs().max()) > 0 else predicted
+
+
+class Unwilling(Moody):
+    """Cannot be recorded."""
+
+    def forward(self, inputs: ForecastWindows) -> Any:
+        if torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
+            raise RuntimeError("not while recorded")
+        return self.network(inputs)
+
+
+@pytest.mark.parametrize("kind", [Moody, Unwilling])
+def test_a_network_whose_recording_gives_other_numbers_runs_as_it_is(kind: type[Moody], traced: Forecaster) -> None:
+    changed = dataclasses.replace(traced, model=kind(traced.model))
+    network = Network(changed)
+    assert not network.is_recorded
+    inputs = arm_windows(traced, 0)
+    assert network.features(inputs).tobytes() == changed.features(inputs).tobytes()
+
+
+def test_a_model_is_recorded_once(traced: Forecaster, tmp_path: Path) -> None:
+    assert traced.single is traced.single

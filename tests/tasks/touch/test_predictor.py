@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +12,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import load, save
 from scipy.spatial.transform import Rotation
 
+from tacpipe.arrays import Bools, Floats
+from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
-from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch import members
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.tasks.touch import members, predictor
+from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.model import TouchModel
-from tacpipe.tasks.touch.predictor import PredictedReading
-from tests.tasks.touch.handmade import OBJECTS, POINTNET, cloud, grasp, grasps, trained
+from tacpipe.tasks.touch.predictor import Baselines, PredictedReading, Predictor
+from tests.tasks.touch.handmade import OBJECTS, POINTNET, cloud, dataset, grasp, grasps, recording, recordings, trained
 
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
 KINDS: dict[str, dict[str, Any]] = {
@@ -183,3 +189,121 @@ def test_the_touch_of_an_object_lies_among_what_was_felt_of_it(models: dict[str,
         felt = grasps(0, 6, kinds=[kind]).readings["pdc_th"]
         touch = models["tree-ensemble"].predict(cloud(9, size_m), grasp(9, size_m))
         assert felt.min() - 60 < touch.pdc_th < felt.max() + 60
+
+
+FELT = {"pdc_th": np.array([[10.0], [20.0], [40.0], [90.0]]), "e_th": np.arange(96.0).reshape(4, 24)}
+
+
+def baselines(objects: tuple[str, ...] = ("ball", "ball", "egg", "")) -> Baselines:
+    return Baselines(FELT, objects, np.array([0, 100, 200, 900], np.int64))
+
+
+def ask(objects: tuple[str, ...], t_ns: tuple[int, ...]) -> Grasps:
+    batch = grasps(0, len(objects), kinds=["ball"])
+    return dataclasses.replace(batch, objects=objects, t_ns=np.array(t_ns, np.int64))
+
+
+def test_the_constant_is_the_mean_of_all_training_grasps() -> None:
+    predicted = baselines().predict(ask(("ball", "drill"), (0, 5)))["constant"]
+    assert predicted["pdc_th"].tolist() == [[40.0], [40.0]]
+    assert predicted["e_th"].tolist() == [list(np.arange(24) + 36.0)] * 2
+
+
+def test_the_object_mean_is_that_of_the_same_object_and_the_constant_for_others() -> None:
+    predicted = baselines().predict(ask(("egg", "ball", "drill", ""), (0, 0, 0, 0)))["object_mean"]
+    assert predicted["pdc_th"].tolist() == [[40.0], [15.0], [40.0], [40.0]]
+    assert predicted["e_th"][1].tolist() == list(np.arange(24) + 12.0)
+
+
+def test_the_nearest_in_time_are_three_whatever_their_object() -> None:
+    predicted = baselines().predict(ask(("drill",) * 3, (90, 1000, 10**18)))["nearest_in_time"]
+    assert predicted["pdc_th"].tolist() == [[(10 + 20 + 40) / 3], [(20 + 40 + 90) / 3], [(20 + 40 + 90) / 3]]
+
+
+def test_of_fewer_than_three_training_grasps_all_are_nearest() -> None:
+    two = Baselines({"pdc_th": FELT["pdc_th"][:2]}, ("a", "b"), np.array([0, 1], np.int64))
+    assert two.predict(ask(("a",), (7,)))["nearest_in_time"]["pdc_th"].tolist() == [[15.0]]
+
+
+def test_tensors_and_their_bytes_give_back_the_baselines() -> None:
+    original = baselines()
+    restored = Baselines.from_tensors(load(save(original.tensors())), original.objects)
+    assert restored.objects == original.objects
+    assert restored.t_ns.tolist() == original.t_ns.tolist()
+    assert {name: felt.tolist() for name, felt in restored.readings.items()} == {n: f.tolist() for n, f in FELT.items()}
+
+
+def test_times_of_nanoseconds_since_1970_keep_their_last_digit() -> None:
+    late = 1_561_629_162_123_456_789
+    original = dataclasses.replace(baselines(), t_ns=np.array([late, late + 1, late + 2, late + 3], np.int64))
+    restored = Baselines.from_tensors(load(save(original.tensors())), original.objects)
+    assert restored.t_ns.tolist() == [late, late + 1, late + 2, late + 3]
+
+
+SHRUNK_OBJECTS = ["cup"] * 10 + ["jar"] * 10 + ["tin"] * 10
+TREES = {"architecture": "trees", "inputs": "xyz", "targets": "pdc_th,e_mf"}
+THREE = dataset(*[recording(n, kind) for kind in ("ball", "melon", "egg") for n in range(6)])
+
+
+def beyond(truth: Floats, fraction: float) -> Callable[[Bools], Mapping[str, Floats]]:
+    """Return a model that predicts so much of what the truth is beyond the constant of what it was trained on."""
+    return lambda in_training: {
+        "pdc_th": (constant := truth[in_training].mean(axis=0)) + fraction * (truth[~in_training] - constant)
+    }
+
+
+@pytest.mark.parametrize(
+    ("fraction", "kept"), [(1.0, 1.0), (2.0, 0.5), (4.0, 0.25), (0.5, 1.0), (-1.0, 0.0), (0.0, 0.0)]
+)
+def test_what_is_kept_is_what_makes_the_predictions_for_left_out_objects_right(fraction: float, kept: float) -> None:
+    truth = np.random.default_rng(0).normal(size=(30, 1))
+    fitted = predictor.fit_shrinkage({"pdc_th": truth}, SHRUNK_OBJECTS, beyond(truth, fraction))
+    assert fitted.factor["pdc_th"] == pytest.approx(kept)
+    np.testing.assert_allclose(fitted.constant["pdc_th"], truth.mean(axis=0))
+
+
+def test_no_model_of_an_object_sees_its_grasps() -> None:
+    trained_objects: list[set[str]] = []
+
+    def predict(in_training: Bools) -> dict[str, Floats]:
+        trained_objects.append(set(np.asarray(SHRUNK_OBJECTS)[in_training]))
+        return {"pdc_th": np.zeros((int((~in_training).sum()), 1))}
+
+    predictor.fit_shrinkage({"pdc_th": np.ones((30, 1))}, SHRUNK_OBJECTS, predict)
+    assert trained_objects == [{"jar", "tin"}, {"cup", "tin"}, {"cup", "jar"}]
+
+
+def test_too_few_objects_are_refused() -> None:
+    with pytest.raises(UsageError):
+        predictor.fit_shrinkage({"pdc_th": np.ones((20, 1))}, SHRUNK_OBJECTS[:20], beyond(np.ones((20, 1)), 1))
+
+
+def test_grasps_of_novel_objects_alone_are_shrunk(tmp_path: Path) -> None:
+    plain, shrunk = (
+        Predictor.load(trained(tmp_path / name, THREE, shrink_novel=on, **TREES))
+        for name, on in (("plain", False), ("shrunk", True))
+    )
+    assert plain.shrinkage is None
+    assert shrunk.shrinkage is not None
+    assert dict(shrunk.shrinkage.factor) == shrunk.config["kept_of_novel"]
+    known_grasps, novel = grasps(20, 3), grasps(20, 3, object="shoe")
+    for target in ("pdc_th", "e_mf"):
+        np.testing.assert_array_equal(
+            shrunk.predict_grasps(known_grasps)[target], plain.predict_grasps(known_grasps)[target]
+        )
+        constant = shrunk.shrinkage.constant[target]
+        assert constant.shape == (biotac_sp.width(target),)
+        expected = constant + shrunk.shrinkage.factor[target] * (plain.predict_grasps(novel)[target] - constant)
+        np.testing.assert_allclose(shrunk.predict_grasps(novel)[target], expected)
+
+
+def test_the_forests_are_the_same_with_and_without_shrinkage(tmp_path: Path) -> None:
+    plain, shrunk = (trained(tmp_path / str(on), THREE, shrink_novel=on, **TREES) for on in (False, True))
+    plain_config, shrunk_config = (json.loads(files["config.json"]) for files in (plain, shrunk))
+    assert plain_config["members"] == shrunk_config["members"]
+    assert "shrink_novel" not in plain_config["params"]
+
+
+def test_a_model_of_two_objects_is_refused_a_shrinkage(tmp_path: Path) -> None:
+    with pytest.raises(UsageError):
+        trained(tmp_path, recordings(), shrink_novel=True, **TREES)

@@ -1,4 +1,4 @@
-"""Slips preceded by alarms, pooled over the runs of a method."""
+"""The page's part on live sessions: there where a result has them, and nowhere else."""
 
 from __future__ import annotations
 
@@ -10,6 +10,52 @@ import pytest
 
 from tacpipe.tasks.forward.report import events
 from tests.report.parts import cells
+
+LIVE = {
+    "mae": {"live": {"t1": 2.5, "t10": 40.0}, "persistence": {"t1": 2.75, "t10": 41.0}},
+    "rows": {"published": 1500, "equal": 1419, "compared": 1489, "differ_after_late_samples": 70, "skipped": 3},
+    "latency": {
+        "count": 1489,
+        "median_ms": 6.25,
+        "p99_ms": 8.5,
+        "largest_ms": 22.0,
+        "above_10_ms": 3,
+        "above_20_ms": 1,
+    },
+    "alarms": {
+        "slip alarm, slips": {
+            "live": {"events": 13, "led": 1, "median_lead_ms": None, "false_alarms_per_hour": 41.5},
+        }
+    },
+}
+
+
+def context(live: dict[str, Any] | None) -> Any:
+    return SimpleNamespace(runs=[SimpleNamespace(details=SimpleNamespace(metrics=SimpleNamespace(live=live)))])
+
+
+def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
+    (fold,) = events.live_folds(context(LIVE))
+    text = str(fold)
+    for words in ("published live", "t+10", "1,419 of 1,489", "slip alarm, slips", "8.5", "41.5"):
+        assert words in text
+
+
+def test_steps_stand_in_their_order() -> None:
+    errors = {"live": {"t1": 1.0, "t10": 3.0, "t5": 2.0}}  # in the order of JSON keys
+    (fold,) = events.live_folds(context({**LIVE, "mae": errors}))
+    text = str(fold)
+    assert text.index("t+1'") < text.index("t+5'") < text.index("t+10'")
+
+
+def test_a_session_without_forecasts_or_alarms_has_its_rows() -> None:
+    (fold,) = events.live_folds(context({**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}))
+    assert "1,500" in str(fold) and "published live" not in str(fold)
+
+
+def test_another_result_has_no_such_part() -> None:
+    assert events.live_folds(context(None)) == []
+
 
 NAMES = ("events", "led", "median_lead_ms", "false_alarms", "minutes")
 
@@ -24,7 +70,7 @@ def method(name: str, *runs: Any) -> Any:
     return SimpleNamespace(name=name, runs=list(runs))
 
 
-def context(*methods: Any) -> Any:
+def slip_context(*methods: Any) -> Any:
     return SimpleNamespace(methods=list(methods))
 
 
@@ -56,7 +102,7 @@ def test_a_run_whose_recordings_do_not_state_slips_counts_for_nothing() -> None:
 
 def test_the_table_has_methods_and_baselines_the_best_first_and_no_interval_of_slips_that_are_alike() -> None:
     best = method("taxelwise", run(model=(10, 6, 120.0, 1200, 4.0), persistence=(10, 1, 20.0, 3, 4.0)))
-    (fold,) = events.slip_folds(context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
+    (fold,) = events.slip_folds(slip_context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
     table, note = fold.blocks
     assert "without an interval" in note.text  # type: ignore[union-attr]
     assert [str(row.cells[0]) for row in table.rows] == ["taxelwise", "gru", "persistence"]  # type: ignore[union-attr]
@@ -64,4 +110,4 @@ def test_the_table_has_methods_and_baselines_the_best_first_and_no_interval_of_s
 
 
 def test_results_of_recordings_without_slips_have_no_such_part() -> None:
-    assert events.slip_folds(context(method("gru", run()))) == []
+    assert events.slip_folds(slip_context(method("gru", run()))) == []

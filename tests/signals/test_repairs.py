@@ -1,4 +1,4 @@
-"""Spikes: against the identifier written out for one reading, and what must not be touched."""
+"""Held frames and what rate is left without them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tacpipe.signals.repairs import hampel
+from tacpipe.signals.repairs import hampel, mean_rate_hz, new_frame_rate_hz, repeated_rows, unwrap
+
+
+def test_a_frame_is_held_only_if_every_channel_repeats() -> None:
+    values = np.array([[1, 1], [1, 1], [1, 2], [1, 2], [2, 2]], dtype=np.uint16)
+    assert repeated_rows(values).tolist() == [False, True, False, True, False]
+
+
+def test_a_recording_of_one_frame_or_none_has_no_held_one() -> None:
+    assert repeated_rows(np.zeros((1, 3))).tolist() == [False]
+    assert repeated_rows(np.zeros((0, 3))).tolist() == []
+
+
+def test_nan_is_never_held() -> None:
+    assert not repeated_rows(np.full((3, 1), np.nan)).any()
+
+
+def test_four_frames_at_40_hz_of_which_three_repeat_are_10_hz() -> None:
+    t_ns = np.arange(41) * 25_000_000
+    repeats = np.arange(41) % 4 != 0
+    assert mean_rate_hz(t_ns) == pytest.approx(40.0)
+    assert new_frame_rate_hz(t_ns, repeats) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("t_ns", [[], [5], [5, 5]])
+def test_a_rate_needs_two_moments(t_ns: list[int]) -> None:
+    assert mean_rate_hz(np.array(t_ns, dtype=np.int64)) == 0.0
 
 
 def spike(values: list[int], row: int, deviations: float, floor: float) -> bool:
@@ -70,3 +96,28 @@ def test_spikes_are_the_same_in_blocks_of_any_size(monkeypatch: pytest.MonkeyPat
     for expected, in_blocks in zip(whole, hampel(values, 7, 1.0, 50.0), strict=True):
         np.testing.assert_array_equal(in_blocks, expected)
     assert whole[0].any()
+
+
+steps = hnp.arrays(np.int32, st.integers(1, 60), elements=st.integers(-32_767, 32_767))
+
+
+@given(st.integers(0, 65_535), steps)
+def test_a_walk_that_was_cut_to_16_bits_comes_back(first: int, moved: np.ndarray) -> None:
+    walk = first + np.cumsum(moved) - moved[0]
+    restored = unwrap(walk.astype(np.uint16))
+    assert restored.tolist() == walk.tolist()
+    np.testing.assert_array_equal(restored, np.unwrap((walk % 65_536).astype(np.int64), period=65_536))
+    signed = unwrap((walk - 32_768).astype(np.int16))
+    np.testing.assert_array_equal(signed, walk - 32_768)
+
+
+@pytest.mark.parametrize("kind", ["uint16", "int16"])
+def test_what_never_wraps_is_the_same_array(kind: str) -> None:
+    values: np.ndarray = np.array([100, 30_000, 12, 32_767], dtype=kind)
+    assert unwrap(values) is values
+    assert unwrap(values[:0]).dtype == kind
+
+
+def test_a_wide_range_without_a_jump_is_no_wrap() -> None:
+    values = np.arange(0, 65_536, 16_384, dtype=np.uint16)
+    assert unwrap(values) is values

@@ -16,7 +16,7 @@ from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import model as touch_prediction
 from tacpipe.tasks.touch.model import TouchModel
-from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
+from tests.tasks.touch.handmade import cloud, dataset, evaluated, recording, recordings, trained
 
 PERCENTS = (10, 50, 90)
 FAST = {"architecture": "trees", "inputs": "xyz"}
@@ -105,3 +105,23 @@ def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None
     request = CalibrationRequest(PERCENTS, True, 0.05, 0)
     with pytest.raises(TacpipeError, match="3 calibration grasps can guarantee a band with a coverage of 75 %"):
         touch_model.calibrate(plain, request, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
+
+
+FEW_TREES = {"architecture": "trees", "targets": "pdc_th,e_mf"}
+
+
+def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> None:
+    files = trained(tmp_path, **FEW_TREES)
+    table = touch_prediction.predict(files, recordings(6, 2, felt=False)).recordings["predictions"].streams[""]
+    assert table.column_names == ["recording", "pdc_th", *(f"e_mf_{n:02d}" for n in range(1, 25))]
+    assert table.column("recording").to_pylist() == ["ball-006", "ball-007", "melon-006", "melon-007"]
+    evaluated_table = evaluated(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
+    assert table.drop_columns(["recording"]).equals(evaluated_table)
+
+
+def test_what_is_not_what_the_model_reads_is_refused(tmp_path: Path) -> None:
+    files = trained(tmp_path, **FEW_TREES)
+    with pytest.raises(TacpipeError, match="no grasp to predict"):
+        touch_prediction.predict(files, dataset())
+    with pytest.raises(TacpipeError, match="melon-003 has a cloud without colours"):
+        touch_prediction.predict(files, dataset(recording(3, "melon", cloud=cloud(3, 0.05, coloured=False))))
