@@ -1,8 +1,8 @@
 """A live session without hardware: `make live-demo`.
 
 A model is trained on simulated trials whose slips the planned motion causes. Then the first paper's rig is emulated with
-further such trials, and the session runs on it. At the end, the slips of the simulation and the alarms are printed, and
-drawn. Seeds and parameters of the simulation are those of the constants below.
+further such trials, a controller sends its plans, and the session runs on it. At the end, the slips of the simulation
+and the alarms are printed, and drawn. Seeds and parameters of the simulation are those of the constants below.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
+from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.simulation.emulation.planner import send_plans
 from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.slip.calibration import EventScore
 from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
@@ -32,49 +34,49 @@ TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
 SEED = 7  # of the emulated world
 LIVE_S = 60.0
+PLAN_RATE_HZ = 10.0  # plans per second
 PER_MINUTE = "1"  # false alarms that the alarm was set for
 TRAINING = (
     *("--streams", "xela*", "--window-s", "0.5", "--horizon-s", "0.3", "--recovery-s", "0.3", "--no-match-time"),
-    *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2"),
+    *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2", "--actions", "planned"),
 )
+VALIDATION = ("--val", "0.25", "--test", "0")  # validation recordings set the level of the alarm
 SWITCH_S = 0.0005
 BEFORE_MS, AFTER_MS = 500.0, 200.0  # time around a slip that is drawn enlarged
 MAX_DRAWN_SLIPS = 6
 LINE, ALARM, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
 
 
-def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
-    """Train, emulate, run live, print what the alarm did, and return the path of the picture.
+def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
+    """Split and train with a seed, emulate, run live, print what the alarm did, and return the path of the picture.
 
     Raises `TacpipeError` if a command fails.
     """
-    _train(output)
+    _train(output, seed)
+    (port,) = free_ports(1)
     world = World(SEED, pick_and_move.PickRig(effort=EFFORT))
     sys.setswitchinterval(SWITCH_S)
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
         (output / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
-        _tacpipe(
-            *(
-                "live",
-                str(output / "emulated" / "rig.toml"),
-                "--model",
-                str(output / "model"),
-                "-o",
-                str(output / "live"),
-            ),
-            *("--duration-s", f"{seconds:g}", "--alarms-per-minute", PER_MINUTE),
-        )
+        rig, model = str(output / "emulated" / "rig.toml"), str(output / "model")
+        with send_plans(emulator, port, PLAN_RATE_HZ):
+            _tacpipe(
+                *("live", rig, "--model", model, "-o", str(output / "live"), "--plan", f"udp:127.0.0.1:{port}"),
+                *("--duration-s", f"{LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
+            )
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
     return _show(output, world, epoch_ns)
 
 
-def _train(output: Path) -> None:
+def _train(output: Path, seed: int) -> None:
     """Simulate trials and train on them; stored results are reused."""
     recordings, split = str(output / "recordings"), str(output / "split")
     options = ("--trials", str(TRIALS), "--seed", str(TRAINING_SEED), "--effort", str(EFFORT))
-    _tacpipe("simulate", "forward", *options, "-o", recordings, "--quiet")
-    _tacpipe("split", recordings, "-o", split, "--scheme", "random", "--val", "0.25", "--test", "0")
-    _tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *TRAINING, "--quiet")
+    planned = ("--plan-rate-hz", f"{PLAN_RATE_HZ:g}")
+    _tacpipe("simulate", "forward", *options, *planned, "-o", recordings, "--quiet")
+    _tacpipe("split", recordings, "-o", split, "--scheme", "random", *VALIDATION, "--seed", str(seed))
+    params = (*TRAINING, "--seed", str(seed))
+    _tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *params, "--quiet")
 
 
 def _tacpipe(*words: str) -> None:
@@ -186,4 +188,4 @@ def _lead_in_words(events: list[EventScore], begin_s: float) -> str:
 
 
 if __name__ == "__main__":
-    terminal.result(run(Path(sys.argv[1]), Path(sys.argv[2])))
+    terminal.result(run(Path(sys.argv[1]), Path(sys.argv[2]), *map(int, sys.argv[3:4])))
