@@ -133,10 +133,13 @@ class Cycle:
 
 
 class World:
-    """One physical simulation for all sensors of a rig. Times are in ns since its start."""
+    """One physical simulation for all sensors of a rig. Times are in ns since its start.
 
-    def __init__(self, seed: int = 0, rig: pick_and_move.PickRig | None = None) -> None:
-        self._seed = seed
+    The hand waits with open fingers for ``idle_s`` before the first cycle.
+    """
+
+    def __init__(self, seed: int = 0, rig: pick_and_move.PickRig | None = None, *, idle_s: float = 0.0) -> None:
+        self._seed, self.idle_ns = seed, round(idle_s * 1e9)
         self._rig = replace(rig or pick_and_move.PickRig(), duration_s=TRIAL_S)
         self._cycle = functools.lru_cache(CYCLES)(self._generate)
         self.skins = pick_and_move.perform(seed, 0, self._rig).skins
@@ -154,6 +157,7 @@ class World:
 
     def at(self, t_ns: Times, value: Callable[[Cycle, Times], Floats]) -> Floats:
         """Return values (time, …) at ascending ``t_ns`` (time,). ``value`` computes them from a cycle and its times."""
+        t_ns = np.maximum(t_ns - self.idle_ns, 0)
         numbers = t_ns // CYCLE_NS
         parts = [
             value(self.cycle(int(number)), t_ns[numbers == number] - number * CYCLE_NS) for number in np.unique(numbers)

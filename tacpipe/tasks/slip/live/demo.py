@@ -33,7 +33,8 @@ from tacpipe.tasks.slip.model import SlipModel
 TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
 SEED = 7  # of the emulated world
-LIVE_S = 60.0
+LIVE_S = 60.0  # time of the emulated trials
+IDLE_S = 20.0  # time before them with open fingers, in which the session starts and measures the level at rest
 PLAN_RATE_HZ = 10.0  # plans per second
 PER_MINUTE = "1"  # false alarms that the alarm was set for
 TRAINING = (
@@ -54,7 +55,7 @@ def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
     """
     _train(output, seed)
     (port,) = free_ports(1)
-    world = World(SEED, pick_and_move.PickRig(effort=EFFORT))
+    world = World(SEED, pick_and_move.PickRig(effort=EFFORT), idle_s=IDLE_S)
     sys.setswitchinterval(SWITCH_S)
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
         (output / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
@@ -62,7 +63,7 @@ def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
         with send_plans(emulator, port, PLAN_RATE_HZ):
             _tacpipe(
                 *("live", rig, "--model", model, "-o", str(output / "live"), "--plan", f"udp:127.0.0.1:{port}"),
-                *("--duration-s", f"{LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
+                *("--duration-s", f"{IDLE_S + LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
             )
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
     return _show(output, world, epoch_ns)
@@ -92,10 +93,16 @@ def _show(output: Path, world: World, epoch_ns: int) -> Path:
 
     recordings = tacpipe.open(output / "live")
     recording = recordings[max(recordings.recordings)]
+    began_ns, ended_ns = (epoch_ns + round((IDLE_S + after_s) * 1e9) for after_s in (0.0, LIVE_S))
+    if int(recording.table("slip")["t_device_ns"][0].as_py()) > began_ns:
+        raise TacpipeError(
+            "The session started after the first trial began. Run the demo again on a less busy computer."
+        )
     model = SlipModel.load(tacpipe.open(output / "model").files)
     stream = recording.table("slip").to_pandas()
+    stream = stream[(stream["t_device_ns"] >= began_ns) & (stream["t_device_ns"] < ended_ns)]
     t_ns = stream["t_device_ns"].to_numpy()
-    truth_ns = np.arange(int(t_ns[0]), int(t_ns[-1]), 1_000_000, dtype=np.int64)
+    truth_ns = np.arange(began_ns, ended_ns, 1_000_000, dtype=np.int64)
     slipping = world.contact(truth_ns - epoch_ns, lambda scene: scene.contact.slip.astype(np.float64)) > 0.5
     track = dataclasses.replace(
         model.reader.track(recording), labels=SlipLabels(merge_events([run_times(truth_ns, slipping)]), None)
