@@ -24,6 +24,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.tasks.slip import training
 from tacpipe.tasks.slip.calibration import EventScore
+from tacpipe.tasks.slip.labels import SlipLabels
 from tacpipe.tasks.slip.live import demo, evaluation
 from tacpipe.tasks.slip.live.engine import FingerSoFar, SlipEngine
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms
@@ -291,12 +292,14 @@ def test_the_options_of_a_session_are_those_of_its_settings() -> None:
     assert SlipSettings().alarms_per_minute == 1.0
 
 
-def test_the_picture_of_the_demo_shows_each_slip(tmp_path: Path) -> None:
+def test_the_picture_of_the_demo_shows_each_slip(rig: Rig, model: SlipModel, tmp_path: Path) -> None:
     import pandas as pd
 
     t_ns = np.arange(200, dtype=np.int64) * PERIOD_NS
     stream = pd.DataFrame({"t_device_ns": t_ns, "probability": np.linspace(0, 1, 200), "alarm": np.arange(200) > 150})
     events = np.array([[t_ns[160], t_ns[165]]])
     event = EventScore("a", "b", t_ns[160] / 1e9, 180.0, 0.0, 280.0)
-    path = demo.draw(tmp_path / "live.png", stream, events, SessionAlarms([event], 0, 0.05), "one slip")
+    read = model.reader.track(rig.recording)  # type: ignore[arg-type]
+    track = dataclasses.replace(read, start_ns=0, labels=SlipLabels(events, None))
+    path = demo.draw(tmp_path / "live.png", stream, track, SessionAlarms([event], 0, 0.05), "one slip")
     assert path.read_bytes().startswith(b"\x89PNG")

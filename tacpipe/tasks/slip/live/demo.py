@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Times
+from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live.preparation import free_ports
@@ -29,6 +29,7 @@ from tacpipe.tasks.slip.calibration import EventScore
 from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
 from tacpipe.tasks.slip.model import SlipModel
+from tacpipe.tasks.slip.windows import GraspTrack
 
 TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
@@ -112,7 +113,7 @@ def _show(output: Path, world: World, epoch_ns: int) -> Path:
     latency_ms = recording.table("latency")["latency_ms"].to_numpy()
     text = described(alarms)
     terminal.note(f"\n{text}\n{latency_in_words(latency_ms)}")
-    return draw(output / "live.png", stream, track.events, alarms, text)
+    return draw(output / "live.png", stream, track, alarms, text)
 
 
 def described(alarms: SessionAlarms) -> str:
@@ -147,7 +148,7 @@ def latency_in_words(latency_ms: AnyFloats) -> str:
     )
 
 
-def draw(path: Path, stream: Any, events: Times, alarms: SessionAlarms, headline: str) -> Path:
+def draw(path: Path, stream: Any, track: GraspTrack, alarms: SessionAlarms, headline: str) -> Path:
     """Draw the probability of a session with its alarms and the slips of the simulation, and each slip enlarged."""
     import matplotlib as mpl
 
@@ -156,6 +157,7 @@ def draw(path: Path, stream: Any, events: Times, alarms: SessionAlarms, headline
 
     t_ns, probability = stream["t_device_ns"].to_numpy(), stream["probability"].to_numpy()
     on = stream["alarm"].to_numpy() > 0
+    events = track.events
     near = events[:MAX_DRAWN_SLIPS]
     figure = pyplot.figure(figsize=(12, 6.5), layout="constrained")
     grid = figure.add_gridspec(2, max(1, len(near)))
@@ -180,7 +182,7 @@ def draw(path: Path, stream: Any, events: Times, alarms: SessionAlarms, headline
         axes.set_xlim(-BEFORE_MS, AFTER_MS)
         axes.set_ylim(0, 1)
         axes.set_xlabel("ms from the slip")
-        axes.set_title(_lead_in_words(alarms.events, (begin - t_ns[0]) / 1e9))
+        axes.set_title(_lead_in_words(alarms.events, (begin - track.start_ns) / 1e9))
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
     return path
