@@ -200,7 +200,7 @@ def param_rows(stage: Any) -> list[list[str]]:
     for name, field in stage_params.fields(stage).items():
         default = " or ".join(f"`{value}`" if value != "" else "empty" for value in stage_params.defaults(stage, name))
         text = comments.get(name, "")
-        if owners := stage_params.having(stage, name):
+        if owners := stage_params.choices_with(stage, name):
             text = f"{text}; only with {stage_params.tag(stage)} {', '.join(map(str, owners))}".lstrip("; ")
         rows.append([f"`{name}`", _cell(fields.describe(field)), default, _cell(text)])
     return rows

@@ -19,5 +19,7 @@ def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> Any:
     stage = registry.load(name)
     tag = params_of.tag(stage) or ""
     chosen = changed.get(tag, usual.get(tag, (params_of.defaults(stage, tag) or [""])[0]))
-    counting = {key: value for key, value in usual.items() if chosen in (params_of.having(stage, key) or [chosen])}
+    counting = {
+        key: value for key, value in usual.items() if chosen in (params_of.choices_with(stage, key) or [chosen])
+    }
     return build_params(name, **{**counting, **changed})

@@ -91,13 +91,13 @@ def test_a_root_that_was_forgotten_since_it_was_listed_is_not_damaged(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = littered.store
-    honest = store.roots.at
+    honest = store.roots.read
 
-    def at(file: Path) -> Any:
+    def read(file: Path) -> Any:
         file.unlink(missing_ok=True)
         return honest(file)
 
-    monkeypatch.setattr(store.roots, "at", at)
+    monkeypatch.setattr(store.roots, "read", read)
     assert repair.verify(store).clean
 
 

@@ -241,7 +241,7 @@ def test_help_shows_choices_ranges_and_whose_an_option_is(name: str, call: Call)
         assert f"--{field.replace('_', '-')}" in printed
         if get_origin(fields.bare(annotation)) is Literal:
             assert f"[{'|'.join(map(str, get_args(fields.bare(annotation))))}]" in printed
-        assert not params_of.having(stage, field) or f"only with {params_of.tag(stage)}" in printed
+        assert not params_of.choices_with(stage, field) or f"only with {params_of.tag(stage)}" in printed
 
 
 @pytest.mark.parametrize("name", STAGES)

@@ -162,7 +162,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "read_record": lambda: store.read_record(key),
         "record": lambda: store.record(key),
         "records": lambda: list(store.records()),
-        "records.naming": lambda: list(records.naming(store, name, 0)),
+        "records.naming": lambda: list(records.find_naming(store, name, 0)),
         "roots.all": lambda: store.roots.all(),
         "roots.get": lambda: store.roots.get(folder / "data/s"),
         "projects.known": lambda: projects.identity_of(store, folder),

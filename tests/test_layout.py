@@ -148,15 +148,15 @@ def test_a_store_that_another_process_begins_between_two_looks_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = Store(tmp_path)
-    honest = layout._may_begin
+    honest = layout._is_empty
 
     def other_is_faster(root: Path) -> bool:
-        monkeypatch.setattr(layout, "_may_begin", honest)
+        monkeypatch.setattr(layout, "_is_empty", honest)
         Store(root).prepare()
         Store(root).put(b"touch")
         return honest(root)
 
-    monkeypatch.setattr(layout, "_may_begin", other_is_faster)
+    monkeypatch.setattr(layout, "_is_empty", other_is_faster)
     assert store.check()
 
 
@@ -255,7 +255,7 @@ def test_what_is_not_of_a_stores_form_is_left_alone_and_named(
     for command in (*READ, "store repair", "store verify --json"):
         ran = made_project.run(command)
     assert json.loads(ran.out)["foreign"] == foreign
-    assert spool_folders.abandoned(root) == []
+    assert spool_folders.find_abandoned(root) == []
     assert (tree(theirs), {name: value for name, value in tree(root).items() if name in foreign}) == before
     output = made_project.run("store verify").out
     assert (

@@ -121,7 +121,9 @@ class Whole:
 
 
 def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
-    filled = params_of.filled(Whole, {"parts": [{"name": "a"}, {"name": "b", "size": 2}], "lid": {"name": "c"}}, "box")
+    filled = params_of.build_dataclass(
+        Whole, {"parts": [{"name": "a"}, {"name": "b", "size": 2}], "lid": {"name": "c"}}, "box"
+    )
     assert filled == Whole((Part("a"), Part("b", 2.0)), Part("c"))
     assert isinstance(filled.parts[1].size, float)
 
@@ -139,7 +141,7 @@ def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
 )
 def test_what_is_wrong_in_a_table_is_told_with_the_table(values: dict[str, object], sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
-        params_of.filled(Whole, values, "box")
+        params_of.build_dataclass(Whole, values, "box")
 
 
 @dataclass(frozen=True)
@@ -251,13 +253,13 @@ def test_help_of_a_field_stands_behind_it_or_above_it_and_is_joined_over_kinds()
     comments = params_of.comments(GROW)
     assert comments["layers"] == "layers of a large one stacked"
     assert (comments["size"], comments["seed"]) == ("small, or tiny; large", "seed of draws")
-    assert params_of.having(GROW, "cells") == ["small", "tiny"] and params_of.having(GROW, "seed") == []
+    assert params_of.choices_with(GROW, "cells") == ["small", "tiny"] and params_of.choices_with(GROW, "seed") == []
 
 
 def test_params_that_count_are_those_of_the_kind_and_all_where_it_is_unknown() -> None:
     stored: dict[str, Any] = {"size": "large", "seed": 1, "cells": 3, "layers": 2, "gone": True}
-    assert params_of.counting(GROW, stored) == {"size": "large", "seed": 1, "layers": 2}
-    assert params_of.counting(GROW, {**stored, "size": "vast"}) == {**stored, "size": "vast"}
+    assert params_of.used_params(GROW, stored) == {"size": "large", "seed": 1, "layers": 2}
+    assert params_of.used_params(GROW, {**stored, "size": "vast"}) == {**stored, "size": "vast"}
 
 
 def test_a_preset_with_a_param_that_there_is_none_of_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,7 +172,7 @@ def _run(
     if not quiet:
         for recording in recorded:
             terminal.note(recording.line())
-        for line in session.lines(figures):
+        for line in session.describe_figures(figures):
             terminal.note(line)
     _report(output, recorded, figures, supervisor, lost, as_json=as_json)
 
@@ -180,7 +180,7 @@ def _run(
 def _lines(supervisor: Supervisor) -> list[str]:
     from tacpipe.live import session
 
-    return session.lines(supervisor.figures())
+    return session.describe_figures(supervisor.figures())
 
 
 def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:

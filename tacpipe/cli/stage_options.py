@@ -103,7 +103,7 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
         annotation = bool | None if kind is bool else list[str] | None if is_sequence else str | None
         text = _about(stage, name, helps.get(name, ""))
         metavar = None if kind is bool else _metavar(hint)
-        owners = params_of.having(stage, name)
+        owners = params_of.choices_with(stage, name)
         option = typer.Option(
             None,
             *flags,
@@ -216,9 +216,9 @@ def _about(stage: AnyStage, name: str, comment: str) -> str:
     if fields_of.constraints(annotation):
         parts.append(fields_of.describe(annotation))
     tag = params_of.tag(stage)
-    if owners := params_of.having(stage, name):
+    if owners := params_of.choices_with(stage, name):
         parts.append(f"only with {tag} {', '.join(owners)}")
-    if name == tag and any(params_of.having(stage, field) for field in params_of.fields(stage)):
+    if name == tag and any(params_of.choices_with(stage, field) for field in params_of.fields(stage)):
         parts.append(f"--{tag} NAME --help shows the options of NAME")
     defaults = [_default(name, value) for value in params_of.defaults(stage, name) if value not in (None, "", ())]
     return "; ".join(parts) + (f" [default: {' or '.join(defaults)}]" if defaults else "")

@@ -105,7 +105,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")
     from tacpipe.engine import grid, pipeline  # These imports are not needed for help.
 
-    requests = grid.requests(_request(name, stage, params, options), grid.folds(options.get("fold") or "0"))
+    requests = grid.requests(_request(name, stage, params, options), grid.parse_folds(options.get("fold") or "0"))
     # Checks and comparisons write nothing.
     headline_file = stage.headline if not (options["check"] or options["compare"]) else None
     report_options = {"as_json": options["json_"], "quiet": options["quiet"]}
@@ -143,7 +143,7 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
     """Report stored results. Raises `UnansweredError` if a result is missing."""
     from tacpipe.engine import pipeline
 
-    outcomes = [outcome for request in requests if (outcome := pipeline.answered(request)) is not None]
+    outcomes = [outcome for request in requests if (outcome := pipeline.existing_outcome(request)) is not None]
     if len(outcomes) < len(requests):
         raise UnansweredError
     for outcome in outcomes:
@@ -210,5 +210,5 @@ def _params_file(options: dict[str, Any]) -> Path | None:
 def _parse_option(value: Any, annotation: Any) -> Any:
     """Return an option's value, converted to its annotation if possible."""
     if isinstance(value, list):
-        return [fields_of.parsed(text, get_args(fields_of.bare(annotation))[0]) for text in value]
-    return fields_of.parsed(value, annotation) if isinstance(value, str) else value
+        return [fields_of.parse_text(text, get_args(fields_of.bare(annotation))[0]) for text in value]
+    return fields_of.parse_text(value, annotation) if isinstance(value, str) else value

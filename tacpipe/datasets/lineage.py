@@ -117,7 +117,7 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Proven
     ``key`` names the run that produced or labelled it, if its root contains that; then no other record is read.
     """
     of_run = store.record(key) if key else None
-    for record in records.naming(store, manifest, written_s) if of_run is None else [of_run]:
+    for record in records.find_naming(store, manifest, written_s) if of_run is None else [of_run]:
         file = record["result"]["files"].get(manifest_of.NAME)
         if file is not None and file["digest"] == manifest:
             return record["provenance"]

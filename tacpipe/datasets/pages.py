@@ -23,7 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, Written, bytes_digest, canonical, digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
-from tacpipe.store.location import locate, opened
+from tacpipe.store.location import locate, open_store
 from tacpipe.store.records import Content, RecordingEntry, Shard
 from tacpipe.store.store import MissingError, Store
 
@@ -230,7 +230,7 @@ class StoredPages:
 
 
 def _stored_pages(place: str | None, directory: Path | None) -> StoredPages:
-    return StoredPages(None if place is None else opened(place), directory)
+    return StoredPages(None if place is None else open_store(place), directory)
 
 
 class Pages:

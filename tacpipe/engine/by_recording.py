@@ -44,7 +44,7 @@ class ByRecording:
     request: Request
     outcome: Outcome
     chosen: ChosenExecutor
-    previous: Previous | None = None  # Earlier run whose unchanged results are reused
+    previous: Previous | None = None  # earlier run whose unchanged results are reused
 
     def run_step(self, source: Manifest, step: Step, dataset_dirs: tuple[str, ...]) -> Mapping[str, RecordingEntry]:
         """Return the result of a map stage, one link of a chain, for each recording of ``source``; raises as `run`.
@@ -54,7 +54,7 @@ class ByRecording:
         in pages.
         """
         entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
-        answered: list[Answer | _RecordingGroup] = []
+        results_or_pending: list[Answer | _RecordingGroup] = []
         missing: list[WorkerTask] = []
         stored: dict[str, ComputedResult] = {}  # records of incomplete groups, by recording
         reusable = None if self.previous is None else self.previous.reusable(entries, step)
@@ -67,7 +67,7 @@ class ByRecording:
             self.store.expect(digest(keys.of_group(step, stage, group.entries())) for group in pages.groups(entries))
         is_paged = len(entries) > pages.INLINE
 
-        def answer(results: Mapping[str, RecordingEntry]) -> Answer:
+        def pack_results(results: Mapping[str, RecordingEntry]) -> Answer:
             return (
                 pages.Pages.from_items((recording, Item(entry)) for recording, entry in results.items())
                 if is_paged
@@ -76,25 +76,25 @@ class ByRecording:
 
         for group in pages.groups(entries):
             if group.page in reusable_pages:
-                answered.append(reusable_pages[group.page])
+                results_or_pending.append(reusable_pages[group.page])
                 continue
             group_entries = group.entries()
             pending = _RecordingGroup(keys.of_group(step, stage, group_entries), group_entries)
             group_results = None if self.request.compare or self._reruns(name) else self._group_entries(pending)
             if group_results is None:
                 tasks = keys.shard_tasks(self.store, replace(source, recordings=group_entries), step, dataset_dirs)
-                group_records, lacking = self._find_stored(name, tasks)
-                if lacking:
+                group_records, uncomputed = self._find_stored(name, tasks)
+                if uncomputed:
                     stored |= group_records
-                    missing += lacking
-                    answered.append(pending)
+                    missing += uncomputed
+                    results_or_pending.append(pending)
                     continue
                 group_results = self._remember_group(name, pending, group_records)
-            answered.append(answer(_after(group_results, group_entries)))
+            results_or_pending.append(pack_results(_with_input_attributes(group_results, group_entries)))
         computed = self._compute_missing(name, missing, stored, len(entries))
 
-        def parts() -> Iterator[Answer]:
-            for answer_or_pending in answered:
+        def iterate_results() -> Iterator[Answer]:
+            for answer_or_pending in results_or_pending:
                 if not isinstance(answer_or_pending, _RecordingGroup):
                     yield answer_or_pending
                     continue
@@ -102,11 +102,13 @@ class ByRecording:
                     recording: computed[recording] for recording in answer_or_pending.entries if recording in computed
                 }
                 group_results = self._remember_group(name, answer_or_pending, records_of)
-                yield answer(_after(group_results, answer_or_pending.entries))
+                yield pack_results(_with_input_attributes(group_results, answer_or_pending.entries))
 
         if is_paged:
-            return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
-        return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
+            return pages.Recordings(
+                pages.Pages.joined(part for part in iterate_results() if isinstance(part, pages.Pages))
+            )
+        return {name: entry for part in iterate_results() if isinstance(part, Mapping) for name, entry in part.items()}
 
     def _group_entries(self, group: _RecordingGroup) -> Mapping[str, RecordingEntry] | None:
         """Return the entries in a group's record, or None if there is no record or an object is missing."""
@@ -123,7 +125,7 @@ class ByRecording:
         Raises `TacpipeError` if recordings could not be read, and `WouldChangeError` if ``--check`` is set and the
         stage would run.
         """
-        return _after(
+        return _with_input_attributes(
             {recording: result["recordings"][""] for recording, result in self.results(name, tasks).items()}, {}
         )
 
@@ -162,7 +164,13 @@ class ByRecording:
     def _compute_missing(
         self, name: str, missing: Sequence[WorkerTask], stored: Mapping[str, ComputedResult], count: int
     ) -> dict[str, ComputedResult]:
-        """Compute the ``missing`` tasks and return their records with the ``stored`` ones; ``count`` is the total."""
+        """Compute the ``missing`` tasks, and return their records with the ``stored`` ones.
+
+        ``count`` is the number of both.
+
+        Raises `WouldChangeError` if ``--check`` is set and a task is missing, and the error of `run` if all recordings
+        failed.
+        """
         if missing and self.request.check:
             raise WouldChangeError(f"{registry.stage_name(name)} would run for {len(missing)} of {count} recordings.")
         complete = {**stored, **self._compute(name, missing, stored)}
@@ -185,7 +193,7 @@ class ByRecording:
         return result
 
     def replay(self, source: Manifest, model: Manifest, dataset_dirs: tuple[str, ...], dataset_name: str) -> Manifest:
-        """Return ``source`` after the stages of a model's chain that it has not gone through yet.
+        """Run the stages of a model's chain that ``source`` has not gone through, and return the resulting manifest.
 
         Shards may be adopted from ``dataset_dirs``, which include the model's directory. Raises `UsageError` if
         ``source`` went through other stages, or if a stage now has another version.
@@ -197,6 +205,7 @@ class ByRecording:
                 f"{selection.chain_difference(model_chain, source.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
+        replayed = source
         for step in model_chain[len(source.chain) :]:
             stage = registry.load(step["stage"])
             if stage.version != step["version"]:
@@ -204,12 +213,12 @@ class ByRecording:
                     f"The model was trained behind version {step['version']} of {step['stage']}; this tacpipe has version "
                     f"{stage.version}. Train it again."
                 )
-            recordings = self.run_step(source, step, dataset_dirs)
+            recordings = self.run_step(replayed, step, dataset_dirs)
             files = {name: model.files[name] for name in step["fitted"] or {}}
-            source = Manifest(
-                step["stage"], step["version"], step["params"], {}, [*source.chain, step], recordings, files
+            replayed = Manifest(
+                step["stage"], step["version"], step["params"], {}, [*replayed.chain, step], recordings, files
             )
-        return source
+        return replayed
 
     def _compute(
         self, name: str, tasks: Sequence[WorkerTask], stored: Mapping[str, ComputedResult]
@@ -242,10 +251,14 @@ class ByRecording:
                 }
                 if self.request.compare and result.recording in stored:
                     self.outcome.compare(stored[result.recording], result.record, result.recording)
-        self._refuse(name, bad)
+        self._raise_failures(name, bad)
         return computed
 
-    def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
+    def _raise_failures(self, name: str, bad: Mapping[str, Done]) -> None:
+        """Add failed recordings to the outcome, and raise their error unless ``--skip-bad`` excuses it.
+
+        ``bad`` contains the failures by recording.
+        """
         source = f"{self.request.source}/"  # The location of files is not part of a manifest
         self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
         other_errors = sorted({(-failure.exit_code, failure.error) for failure in bad.values() if not failure.at_fault})
@@ -255,9 +268,9 @@ class ByRecording:
             raise error(FAILED, other_errors[0][1])
         if not bad or (self.request.skip_bad and not other_errors):
             return
-        waited = [failure.error for failure in bad.values() if failure.exit_code == LOCKED]
-        if waited:  # another process is computing the recording, which may be valid
-            raise LockedError(waited[0])
+        lock_errors = [failure.error for failure in bad.values() if failure.exit_code == LOCKED]
+        if lock_errors:  # another process is computing the recording, which may be valid
+            raise LockedError(lock_errors[0])
         lines = _lines({recording: bad[recording].error for recording in bad})
         plural = "recordings" if len(bad) > 1 else "recording"
         advice = "fix these." if other_errors else "fix these, or leave them out with --skip-bad."
@@ -268,8 +281,10 @@ class ByRecording:
         )
 
 
-def _after(results: Mapping[str, RecordingEntry], entries: Mapping[str, RecordingEntry]) -> dict[str, RecordingEntry]:
-    """Return results ordered by name, each with the attributes of its entry in ``entries`` first."""
+def _with_input_attributes(
+    results: Mapping[str, RecordingEntry], entries: Mapping[str, RecordingEntry]
+) -> dict[str, RecordingEntry]:
+    """Return results ordered by name. If ``entries`` has the recording, its attributes precede those of the result."""
     return {
         name: {
             "attributes": {**entries[name]["attributes"], **entry["attributes"]}

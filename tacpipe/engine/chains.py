@@ -65,6 +65,10 @@ def expand(definition: Json, values: Variables, place: str) -> Iterator[tuple[st
 
 
 def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Variables]]:
+    """Yield the name part and the variables (``item``, and ``key`` for a mapping) of each stage of a ``foreach``.
+
+    Raises `UsageError` if ``items`` is not a list or mapping.
+    """
     if isinstance(items, Mapping):
         yield from ((_text(key), {"key": _text(key), "item": item}) for key, item in items.items())
     elif isinstance(items, list):
@@ -75,6 +79,10 @@ def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Variables]]:
 
 
 def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Variables]]:
+    """Yield the name part and the variables of each combination of a ``matrix``, which has a list of items per axis.
+
+    Raises `UsageError` if ``axes`` is not a mapping of lists.
+    """
     if not isinstance(axes, Mapping) or not all(isinstance(items, list) for items in axes.values()):
         raise UsageError(f"{place}: matrix is {excerpt(axes)}; it must be a mapping of lists.")
     for chosen in product(*(enumerate(items) for items in axes.values())):
@@ -94,6 +102,7 @@ def _value_text(name: str, values: Variables, place: str) -> str:
 
 
 def _value(name: str, values: Variables, place: str) -> Any:
+    """Return the value of a name such as ``a.b[1]``. Raises `UsageError` if it has none."""
     value: Any = values
     for part in _PART.findall(name):
         try:
@@ -175,7 +184,7 @@ def load(file: Path, names: Sequence[str] = ()) -> Chain:
     circular dependencies.
     """
     by_name: dict[str, ChainStage] = {}
-    for stage in _stages(file):
+    for stage in _read_stages(file):
         if by_name.setdefault(stage.name, stage) != stage:
             raise UsageError(f"{file} has two stages {plain(stage.name)}; give one of them another name.")
     stages = list(by_name.values())
@@ -188,10 +197,14 @@ def load(file: Path, names: Sequence[str] = ()) -> Chain:
     return Chain([by_name[name] for name in ordered if name in needed], after)
 
 
-def _stages(file: Path) -> Iterator[ChainStage]:
-    content = _mapping(file)
+def _read_stages(file: Path) -> Iterator[ChainStage]:
+    """Yield the stages of a ``dvc.yaml`` file, with ``foreach`` and ``matrix`` expanded.
+
+    Raises `UsageError` if it is invalid.
+    """
+    content = _read_mapping(file)
     _check(content, _FILE, str(file))
-    values = _values(file, content.get("vars", []), _mapping(file.with_name(PARAMS), missing=True), str(file))
+    values = _values(file, content.get("vars", []), _read_mapping(file.with_name(PARAMS), missing=True), str(file))
     if not content.get("stages"):
         raise UsageError(f"{file} has no stages; it must hold them as a dvc.yaml does: `dvc stage add` writes one.")
     for name, definition in content["stages"].items():
@@ -206,7 +219,7 @@ def _stages(file: Path) -> Iterator[ChainStage]:
                     raise UsageError(f"{place}: foreach and do belong together, and it has no {key}.")
             _check(definition["do"], _STAGE, f"{place}, do")
         for key, stage_definition, stage_values in expand(definition, values, place):
-            yield _stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
+            yield _build_stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
 
 
 def _check(content: Json, schema: Json, place: str) -> None:
@@ -220,7 +233,11 @@ def _check(content: Json, schema: Json, place: str) -> None:
 
 
 def _fits(value: Any, schema: Any) -> bool:
-    """Return whether a value matches a schema: a type, or a list, mapping or tuple of schemas."""
+    """Return whether a value matches a schema.
+
+    A schema is a type, a tuple of alternatives, a list with the schema of its items, or a mapping with the schema of
+    each key (``str`` for all keys).
+    """
     if isinstance(schema, tuple):
         return any(_fits(value, choice) for choice in schema)
     if isinstance(schema, list):
@@ -234,10 +251,14 @@ def _fits(value: Any, schema: Any) -> bool:
     return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
-def _stage(name: str, definition: Json, values: Variables, file: Path, place: str) -> ChainStage:
-    values = _values(file, definition.get("vars", []), values, place)
+def _build_stage(name: str, definition: Json, values: Variables, file: Path, place: str) -> ChainStage:
+    """Return a stage with its templates filled in.
+
+    Raises `UsageError` for invalid commands and paths, and for a ``wdir`` other than the folder of ``file``.
+    """
+    stage_values = _values(file, definition.get("vars", []), values, place)
     used = {key: definition[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in definition}
-    resolved = fill_template(used, values, place)
+    resolved = fill_template(used, stage_values, place)
     commands = resolved["cmd"] if isinstance(definition.get("cmd"), list) else [resolved.get("cmd")]
     if not commands or not all(isinstance(command, str) for command in commands):
         raise UsageError(f"{place}: its cmd is {excerpt(resolved.get('cmd'))}; it must be {_EXPECTED['cmd']}.")
@@ -262,7 +283,10 @@ def _stage(name: str, definition: Json, values: Variables, file: Path, place: st
 
 
 def _paths(entries: Sequence[Any], folder: str, place: str) -> list[str]:
-    """Return the paths of entries, which are paths or mappings from paths to options, relative to ``folder``."""
+    """Return the paths of entries, which are paths or mappings from paths to options.
+
+    Paths within ``folder`` become relative to it, others absolute. Raises `UsageError` for an entry that is not a path.
+    """
     paths = []
     for entry in entries:
         for path in entry if isinstance(entry, Mapping) else [entry]:
@@ -278,18 +302,22 @@ def _is_within(path: str, folder: str) -> bool:
 
 
 def _values(file: Path, entries: Sequence[Any], before: Variables, place: str) -> Variables:
-    """Return the values available to texts: those of ``before``, overridden by those of ``vars``."""
+    """Return the variables ``before``, overridden by ``entries`` of ``vars``: mappings, or names of YAML files.
+
+    Raises `UsageError` for other entries.
+    """
     values = before
     for entry in entries:
-        if isinstance(entry, str) and entry.endswith((".yaml", ".yml")):
-            entry = _mapping(file.with_name(entry))
-        if not isinstance(entry, Mapping):
+        is_file = isinstance(entry, str) and entry.endswith((".yaml", ".yml"))
+        variables = _read_mapping(file.with_name(entry)) if is_file else entry
+        if not isinstance(variables, Mapping):
             raise UsageError(f"{place}: vars has {excerpt(entry)}; `tacpipe run` reads mappings and YAML files there.")
-        values = _merge_values(values, entry)
+        values = _merge_values(values, variables)
     return values
 
 
 def _merge_values(before: Variables, over: Variables) -> Variables:
+    """Return the variables ``before`` overridden by ``over``; mappings with the same name are merged."""
     merged = {
         key: _merge_values(existing, value)
         if isinstance(value, Mapping) and isinstance(existing := before.get(key), Mapping)
@@ -299,8 +327,11 @@ def _merge_values(before: Variables, over: Variables) -> Variables:
     return {**before, **merged}
 
 
-def _mapping(file: Path, *, missing: bool = False) -> Json:
-    """Return the contents of a YAML file; an empty mapping if the file does not exist and may be ``missing``."""
+def _read_mapping(file: Path, *, missing: bool = False) -> Json:
+    """Return the content of a YAML file; an empty mapping if the file does not exist and may be ``missing``.
+
+    Raises `UsageError` if it cannot be read as a mapping.
+    """
     try:
         value = config_text.load_yaml(regular.content(file, config_text.MAX_CHARACTERS))
     except FileNotFoundError:
@@ -317,7 +348,10 @@ def _mapping(file: Path, *, missing: bool = False) -> Json:
 
 
 def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozenset[str]]:
-    """Return for each stage the names of the stages whose outputs, or parts of them, it reads."""
+    """Return for each stage the names of the stages whose outputs, or parts of them, it reads.
+
+    Raises `UsageError` if two stages write to the same path, or one within a path of the other.
+    """
     writers: dict[str, str] = {}
     writers_below: dict[str, set[str]] = {}  # stages that write below a folder, by folder
     for stage in stages:
@@ -351,6 +385,10 @@ def _above(path: str) -> Iterator[str]:
 def _needed_stages(
     stages: Mapping[str, ChainStage], after: Mapping[str, frozenset[str]], names: Sequence[str], file: Path
 ) -> set[str]:
+    """Return ``names``, which are stages or groups, and all stages that they depend on; all stages without ``names``.
+
+    Raises `UsageError` for an unknown name. ``after`` contains the dependencies of each stage.
+    """
     if not names:
         return set(stages)
     needed: set[str] = set()
@@ -360,9 +398,9 @@ def _needed_stages(
             groups = dict.fromkeys(stage.group for stage in stages.values())
             raise UsageError(f"{file} has no stage {plain(name)}; it has {listed(groups, _SHOWN)}.")
         needed |= chosen
-    waiting = list(needed)
-    while waiting:
-        new = after[waiting.pop()] - needed
+    unvisited = list(needed)
+    while unvisited:
+        new = after[unvisited.pop()] - needed
         needed |= new
-        waiting += new
+        unvisited += new
     return needed

@@ -22,7 +22,7 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.store import records
-from tacpipe.store.location import opened
+from tacpipe.store.location import open_store
 from tacpipe.store.records import Provenance, StoredResult
 from tacpipe.store.store import Store
 from tacpipe.training import devices
@@ -39,9 +39,9 @@ class _Computing:
 
     def __call__(self, task: WorkerTask) -> Done:
         """Compute a task and return its outcome; a `TacpipeError` becomes a `Done` with its message."""
-        store = opened(task.store, task.run)
+        store = open_store(task.store, task.run)
         try:
-            return _begin(task, store)()
+            return _compute_task(task, store)()
         finally:
             store.close()
 
@@ -54,14 +54,14 @@ class _Computing:
         stores: dict[tuple[str, str], Store] = {}
         for task in tasks:
             if (task.store, task.run) not in stores:
-                stores[task.store, task.run] = opened(task.store, task.run)
+                stores[task.store, task.run] = open_store(task.store, task.run)
         pairs = [(task, stores[task.store, task.run]) for task in tasks]
         try:
             if len(tasks) >= _MANY and any(store.distant for store in stores.values()):
                 yield from _overlap_tasks(pairs)
             else:
                 for task, store in pairs:
-                    yield _begin(task, store)()
+                    yield _compute_task(task, store)()
         finally:
             for store in stores.values():
                 store.close()
@@ -71,38 +71,38 @@ compute = _Computing()
 
 
 def _overlap_tasks(tasks: Sequence[tuple[WorkerTask, Store]]) -> Iterator[Done]:
-    """Yield the outcome of each task. Stages run only in this thread."""
+    """Yield the outcome of each task. Stages run only in this thread; other threads look up records and upload results."""
     from concurrent.futures import ThreadPoolExecutor  # not loaded for a cache hit
 
     pool = ThreadPoolExecutor(MAX_PENDING)
-    looks: deque[Future[None]] = deque()
-    sent: deque[Future[Done]] = deque()
-    unsent: list[Callable[[], Done]] = []
+    lookups: deque[Future[None]] = deque()
+    uploads: deque[Future[Done]] = deque()
+    finishers: list[Callable[[], Done]] = []
     try:
         for task, store in tasks[:MAX_PENDING]:
-            looks.append(pool.submit(store.seek, digest(task.identity)))
+            lookups.append(pool.submit(store.seek, digest(task.identity)))
         for index, (task, store) in enumerate(tasks):
             with contextlib.suppress(TacpipeError):  # the next access reports the error
-                looks.popleft().result()
+                lookups.popleft().result()
             if index + MAX_PENDING < len(tasks):
-                later, its_store = tasks[index + MAX_PENDING]
-                looks.append(pool.submit(its_store.seek, digest(later.identity)))
-            unsent.append(_begin(task, store))
-            sent.append(pool.submit(unsent[-1]))
-            while sent and (sent[0].done() or len(sent) > MAX_PENDING):
-                unsent.pop(0)
-                yield sent.popleft().result()
-        while sent:
-            unsent.pop(0)
-            yield sent.popleft().result()
+                later, later_store = tasks[index + MAX_PENDING]
+                lookups.append(pool.submit(later_store.seek, digest(later.identity)))
+            finishers.append(_compute_task(task, store))
+            uploads.append(pool.submit(finishers[-1]))
+            while uploads and (uploads[0].done() or len(uploads) > MAX_PENDING):
+                finishers.pop(0)
+                yield uploads.popleft().result()
+        while uploads:
+            finishers.pop(0)
+            yield uploads.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
-        for finish, future in zip(unsent, sent, strict=False):
+        for finish, future in zip(finishers, uploads, strict=False):
             if future.cancelled() and isinstance(finish, _Sending):
                 finish.leases.close()
 
 
-def _begin(task: WorkerTask, store: Store) -> Callable[[], Done]:
+def _compute_task(task: WorkerTask, store: Store) -> Callable[[], Done]:
     """Compute the task unless its record is stored; return a function that stores the result and returns the outcome."""
     key = digest(task.identity)
     try:
@@ -159,6 +159,10 @@ class _Sending:
 
 
 def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack) -> Done | _Made:
+    """Return the stored result of a task as `Done`, or compute a new one, which is still to be stored.
+
+    A new result comes with the lease of ``key`` in ``leases``. The result of a dry task is never stored.
+    """
     if task.dry:
         result, _ = execution.execute(task, store, ScratchStore())
         return Done(task.recording, {"result": result, "provenance": provenance.describe_provenance(0.0)})

@@ -27,7 +27,7 @@ from tacpipe.plugins import extras, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
-from tacpipe.store.location import opened
+from tacpipe.store.location import open_store
 from tacpipe.store.records import Provenance, RecordingEntry, Shard, StageIdentity, StoredResult
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
@@ -113,6 +113,7 @@ def _result(name: str, stage: AnyStage, returned: Any) -> Result:
 
 
 def _store_returned(returned: Result, sink: Store | ScratchStore, *, durable: bool) -> StoredResult:
+    """Store the content of a stage's result, and return the ``result`` of the record."""
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
@@ -177,7 +178,7 @@ class _Reader:
 
 
 def _open_reader(place: str, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
-    return _Reader(opened(place), dataset_dirs, sizes)
+    return _Reader(open_store(place), dataset_dirs, sizes)
 
 
 def reader(
@@ -192,8 +193,9 @@ def reader(
     return _Reader(store, dataset_dirs, sizes)
 
 
-def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
-    content = paths.verified_copy(name, path, beside_of, size)
+def _adopt(store: Store, name: str, path: str, dataset_dirs: tuple[str, ...], size: int | None) -> bytes | None:
+    """Return an intact copy of an object from ``beside_of``, and store it; None if there is no copy."""
+    content = paths.verified_copy(name, path, dataset_dirs, size)
     if content is not None:
         with contextlib.suppress(TacpipeError):  # a read-only store stays damaged; the intact copy is used
             store.prepare()
@@ -202,6 +204,10 @@ def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size:
 
 
 def _remake(store: Store, name: str, path: str, problem: str, size: int | None = None) -> bytes:
+    """Recompute an object by running a stage that made it, and return its content.
+
+    Raises `DamagedError`, which starts with ``problem``, if no stage makes the object again, or if it is a recording.
+    """
     obstacle = ""
     for identity, made_by in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
@@ -231,8 +237,10 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
             _remaking.discard(key)
         if store.has(name, size):
             return store.read(name, size)
-        unlike = "; ".join(provenance.unlike(made_by, provenance.describe_provenance(0.0)))
-        obstacle = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
+        differences = "; ".join(provenance.unlike(made_by, provenance.describe_provenance(0.0)))
+        obstacle = (
+            f"{identity['stage']} gave something else when it was run again ({differences or 'it depends on chance'})"
+        )
     reason = obstacle or f"nothing in the store says how {path} was made"
     raise DamagedError(
         f"{problem} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage again."
@@ -259,7 +267,10 @@ def _makers(store: Store, name: str) -> list[_Maker]:
 
 @contextmanager
 def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict[str, object]]:
-    """Yield the stage's arguments by name, prepared from the identity."""
+    """Yield the stage's arguments by name, prepared from the identity.
+
+    Raises `StorageError` at the end of the block if a source file changed meanwhile.
+    """
     read = reader(store, task.dataset_dirs)
     inputs = task.identity["inputs"]
     arguments: dict[str, object] = {}
@@ -283,7 +294,7 @@ def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict
         elif kind == "Roles":
             arguments[name] = _roles(inputs[name], read)
         else:
-            arguments[name] = _begun_workspace(store, digest(task.identity))
+            arguments[name] = _prepare_workspace(store, digest(task.identity))
     yield arguments
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files") or ""][file]:
@@ -305,14 +316,18 @@ def workspace(store: Store, key: str) -> Path:
     return store.root / "checkpoints" / key
 
 
-def _begun_workspace(store: Store, key: str) -> Path:
+def _prepare_workspace(store: Store, key: str) -> Path:
+    """Return the workspace of a training; it is created if needed, and checkpoints that other code wrote are deleted.
+
+    Raises `StorageError` if it is a symbolic link.
+    """
     folder = workspace(store, key)
     if folder.is_symlink():
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
     folder.mkdir(parents=True, exist_ok=True)
-    written_by, code = folder / _CODE, provenance.code_of_training().encode()
+    code_file, code = folder / _CODE, provenance.code_of_training().encode()
     try:
-        stored = regular.content(written_by, follow=False)
+        stored = regular.content(code_file, follow=False)
     except (FileNotFoundError, TacpipeError):
         stored = b""
     if stored != code:
@@ -321,7 +336,7 @@ def _begun_workspace(store: Store, key: str) -> Path:
             log.warning("The checkpoint in %s was written by other code; training starts over.", folder)
         for path in checkpoints:
             path.unlink(missing_ok=True)
-        write_whole(str(written_by), code, str(folder / f"{_CODE}.{uuid.uuid4().hex}"))
+        write_whole(str(code_file), code, str(folder / f"{_CODE}.{uuid.uuid4().hex}"))
     return folder
 
 
@@ -359,7 +374,7 @@ def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
     if registry.load_step(task.name).argument("Workspace") is None:
         yield ()
         return
-    store = opened(task.store)
+    store = open_store(task.store)
     # the workspace of a remote store is in the worker's folder
     local_workspace = None if store.distant else workspace(store, digest(task.identity))
     with display.followers_on_stderr(registry.stage_name(task.name), local_workspace) as displays:
@@ -373,6 +388,7 @@ def _digests(value: DatasetIdentity) -> Iterator[str]:
 
 
 def _dataset(value: DatasetIdentity, read: Callable[[str, str], bytes]) -> Dataset:
+    """Return a dataset without path from its part of a key."""
     lineage = value["lineage"]
     manifest = Manifest(
         stage=lineage["stage"],
@@ -386,6 +402,10 @@ def _dataset(value: DatasetIdentity, read: Callable[[str, str], bytes]) -> Datas
 
 
 def _recording(name: str, returned: Any) -> RecordingOutput:
+    """Return what a stage returned for a recording as a `RecordingOutput`.
+
+    Raises `TacpipeError` if it has another type.
+    """
     if isinstance(returned, RecordingOutput):
         return returned
     if hasattr(returned, "schema") or isinstance(returned, Mapping):

@@ -26,10 +26,10 @@ PLACE = "{fold}"  # placeholder for the fold's number in paths
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 
 
-def folds(text: str) -> tuple[int, ...]:
+def parse_folds(text: str) -> tuple[int, ...]:
     """Return the folds in an option's text, in order. Raises `UsageError` if there are none.
 
-    >>> folds("3"), folds("0-3"), folds("4,0-1,1")
+    >>> folds("3"), folds("0-3"), parse_folds("4,0-1,1")
     ((3,), (0, 1, 2, 3), (4, 0, 1))
     """
     numbers: dict[int, None] = {}
@@ -65,20 +65,24 @@ def _fold_request(request: Request, number: int) -> Request:
 
 
 def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:
-    """Yield each request with its outcome when it ends, running ``jobs`` at a time (0 for one per core).
+    """Run ``jobs`` requests at a time (0: one per core), and yield each with its outcome or error when it ends.
 
     A request that fails does not stop the others. The processes end with this one, like those of `Local`.
     """
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(requests)]
     pool = Local(jobs, pool_from=2)
-    at_once = min(pool.jobs, len(tasks))
-    with provenance.shared_by(at_once), terminal.progress_bar(f"{requests[0].name}, folds", len(requests)) as advance:
-        for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
+    concurrent = min(pool.jobs, len(tasks))
+    with (
+        provenance.shared_by(concurrent),
+        terminal.progress_bar(f"{requests[0].name}, folds", len(requests)) as advance,
+    ):
+        for position, result in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
             advance(note=str(requests[position].output))
-            yield requests[position], became
+            yield requests[position], result
 
 
 def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:
+    """Run a request; return its position with the outcome, or with the error that it raised."""
     position, request = task
     with terminal.showing_progress(False):
         try:
@@ -145,6 +149,7 @@ def _is_missing(request: Request) -> bool:
 
 
 def _measure_duration(request: Request) -> float | None:
+    """Run a training until its duration is known, and return that in seconds; None if no network is trained."""
     stopwatch = _Stopwatch()
     try:
         with following.track_with([stopwatch]):
@@ -172,6 +177,10 @@ class _Stopwatch:
         self._network, self._done = network, len(history)
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
+        """Estimate the total duration after `TIMED_S` of batches, and raise `_TimedError`, which ends the training.
+
+        ``passed`` is the fraction of the epoch that the batches so far make up.
+        """
         loss()  # blocks until the device has finished
         now_s = time.monotonic()
         if self._first is None and passed < 1:

@@ -72,11 +72,11 @@ class Outcome:
         _add_counts(self.packages, summary.get("packages") or {})
 
     def compare(self, stored: ComputedResult, recomputed: ComputedResult, name: str) -> None:
-        """Add the differences between two records of one result; ``name`` is the stage or the recording."""
+        """Compare two records of a result, and add the differences. ``name`` is the stage or the recording."""
         differs = execution.differences(stored["result"], recomputed["result"], name)
         self.differs += differs
-        unlike = provenance.unlike(stored["provenance"], recomputed["provenance"]) if differs else []
-        self.unlike += [difference for difference in unlike if difference not in self.unlike]
+        environment_differences = provenance.unlike(stored["provenance"], recomputed["provenance"]) if differs else []
+        self.unlike += [difference for difference in environment_differences if difference not in self.unlike]
 
     def of_results(self) -> Summary:
         """Return the summary of all added records, to be stored in the record of a run."""
@@ -97,9 +97,11 @@ class Outcome:
         count = self.ran + self.reused
         lines = []
         for text, names in self.recordings_by_note.items():
-            subject = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
-            subject = f"all {count} recordings" if len(names) == count else subject
-            lines.append(f"{subject}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
+            subject = names[0]  # empty for a stage that reads whole datasets
+            if len(names) > 1:
+                named = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
+                subject = f"all {count} recordings" if len(names) == count else named
+            lines.append(f"{subject}: {text}" if subject else text)
         stages = {name: line for name, counts in self.code.items() if (line := _other_code(name, counts))}
         packages = {name: line for name, counts in self.packages.items() if (line := _other_package(name, counts))}
         described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
@@ -121,7 +123,7 @@ class Outcome:
 
 
 def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[str, int]]) -> None:
-    """Add the number of results by code to ``total``, by stage or package."""
+    """Add ``counts``, the number of results by stage or package and by code, to ``total``."""
     for name, numbers in counts.items():
         added = total.setdefault(name, {})
         for code, number in numbers.items():
@@ -129,7 +131,10 @@ def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[s
 
 
 def _other_package(package: str, counts: Mapping[str, int]) -> str:
-    """Return the warning for a plug-in package as `_other_code` does for a stage."""
+    """Return a warning if results were computed by other code of a plug-in package; else an empty string.
+
+    ``counts`` are the numbers of results by code.
+    """
     now = registry.package_code(package)  # None if the package was removed; its results stay valid
     outdated = sum(number for code, number in counts.items() if code != now)
     if now is None or not outdated:

@@ -79,31 +79,31 @@ def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: Com
     published, its inputs are not collected. If an object turns out to be damaged when it is linked, the result is
     recomputed.
     """
-    place = _output_place(store, request)
-    if (unread := place.unread(work)) is not None:
+    target = _output_place(store, request)
+    if (unread := target.unread(work)) is not None:
         return unread
-    look = place.look()
-    hit = None if request.compare or request.rerun else work.answer()
-    is_shown = hit is not None and place.shows(hit, look)
-    if is_shown and hit is not None:
-        place.note(look, work, hit)
+    directory_look = target.look()
+    stored = None if request.compare or request.rerun else work.answer()
+    is_shown = stored is not None and target.shows(stored, directory_look)
+    if is_shown and stored is not None:
+        target.note(directory_look, work, stored)
     if not (is_shown or request.compare):
-        place.refuse(plan)
+        target.refuse(plan)
     if is_shown or request.check or request.compare:
-        manifest = place.settled(hit or work.make())
+        manifest = target.settled(stored or work.make())
         if request.check:
-            place.check(manifest)
+            target.check(manifest)
         return manifest
-    with store.at_work([*work.reads, *place.source_manifests]):
-        previous = None if request.rerun else place.previous()
+    with store.at_work([*work.reads, *target.source_manifests]):
+        previous = None if request.rerun else target.previous()
         result: Manifest | None = None
         try:
             result = work.result(rerun=request.rerun, previous=previous)
-            return place.published(work, result, previous)
+            return target.published(work, result, previous)
         except MissingError:  # linking found a damaged object: recompute all that are damaged
             if result is not None:
                 _quarantine_damaged(store, result)
-            return place.published(work, work.result(rerun=False))
+            return target.published(work, work.result(rerun=False))
 
 
 def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
@@ -116,15 +116,15 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
 
 def existing_answer(store: Store, request: Request, work: CommandSource) -> Manifest | Unread | None:
     """Return the result of `settle` if the output already shows the stored result, else None. Changes nothing."""
-    place = _output_place(store, request)
-    if (unread := place.unread(work)) is not None:
+    target = _output_place(store, request)
+    if (unread := target.unread(work)) is not None:
         return unread
-    look = place.look()
-    hit = work.answer()
-    if hit is None or not place.shows(hit, look):
+    directory_look = target.look()
+    stored = work.answer()
+    if stored is None or not target.shows(stored, directory_look):
         return None
-    place.note(look, work, hit)
-    return place.settled(hit)
+    target.note(directory_look, work, stored)
+    return target.settled(stored)
 
 
 def _output_place(store: Store, request: Request) -> _Place:
@@ -195,11 +195,12 @@ class _Directory(_Place):
 
     _linked = False  # whether the directory contains only links to objects
 
-    def shows(self, hit: Manifest, look: Look | None) -> bool:
+    def shows(self, stored: Manifest, look: Look | None) -> bool:
+        """Return whether the directory shows ``hit``. Sets ``_linked`` to whether it contains only links to objects."""
         root = self.root
         if root is None:
             return False
-        expected = self.settled(hit)
+        expected = self.settled(stored)
         is_current = root["manifest"] == expected.content_digest and self.store.has(root["manifest"])
         self._linked = False
         if not is_current:
@@ -222,6 +223,7 @@ class _Directory(_Place):
         return None
 
     def unread(self, work: CommandSource) -> Unread | None:
+        """Return a substitute for the manifest if a note shows that the directory has the result of ``work``, else None."""
         request = self.request
         if request.compare or request.rerun or request.track or request.check:
             return None
@@ -246,6 +248,7 @@ class _Directory(_Place):
 
     @property
     def source_manifests(self) -> list[str]:
+        """Return the manifest that the directory shows and its inputs, by digest; an empty list without a valid note."""
         return (
             []
             if self._valid_note is None
@@ -256,6 +259,10 @@ class _Directory(_Place):
         return None if self._valid_note is None else previous_of.find(self.store, self.path, self._valid_note)
 
     def published(self, work: CommandSource, result: Manifest, previous: Previous | None = None) -> Manifest:
+        """Publish ``result``, and note that the directory is complete, so that the next check is fast.
+
+        Return what it shows.
+        """
         published = self.publish(result, previous, work.key)
         if result.copied or published.pages is None:
             return published
@@ -284,17 +291,19 @@ class _Directory(_Place):
         """
         if not result.recorded:
             return result
-        before = replacing.occupant(self.store, self.request.output)
-        if before is not None and before.stage != result.stage:
-            before = None
-        returning = replacing.returning_labels(self.store, self.request.output, before, result)
-        if before is None:
-            return _with_labels(result, returning)
-        if replacing.irreplaceable(result) and not self.request.replace:
-            result = replacing.appended(before, result)
-        return _with_labels(result, {**returning, **before.labels})
+        existing = replacing.occupant(self.store, self.request.output)
+        if existing is not None and existing.stage != result.stage:
+            existing = None
+        returning_labels = replacing.returning_labels(self.store, self.request.output, existing, result)
+        if existing is None:
+            return _with_labels(result, returning_labels)
+        appends = replacing.irreplaceable(result) and not self.request.replace
+        return _with_labels(
+            replacing.appended(existing, result) if appends else result, {**returning_labels, **existing.labels}
+        )
 
     def check(self, result: Manifest) -> None:
+        """Raise an error if publishing ``result`` would change the directory, or lose something that was edited by hand."""
         self._refuse_losses(result)
         edited = directory.edited_files(self.store, result, self.path) if result.exported else []
         if edited and not self.request.replace:
@@ -302,18 +311,19 @@ class _Directory(_Place):
         super().check(result)
 
     def publish(self, result: Manifest, previous: Previous | None = None, key: str = "") -> Manifest:
+        """Publish ``result`` in the directory, record it as the root, and return the manifest in its published form."""
         if not result.recorded and directory.shows(self.store, result, self.path):
             deliver(self.store, self.path, result)
             self.store.roots.set(self.path, result.content_digest, key=key)
             return result
 
-        def decided() -> directory.DirectoryChange:  # labels may have been set in the meantime
+        def decide_change() -> directory.DirectoryChange:  # labels may have been set in the meantime
             settled = self.settled(result)
             self._refuse_losses(settled)
             complete = previous is not None and previous.is_current()
             return directory.DirectoryChange(settled, is_complete=complete, replace=self.request.replace, key=key)
 
-        return directory.change(self.store, self.request.output, decided)
+        return directory.change(self.store, self.request.output, decide_change)
 
     def _refuse_losses(self, result: Manifest) -> None:
         if not self.request.replace:
@@ -339,6 +349,7 @@ class _File(_Place):
         return is_current and file_digest(self.path) == self._digest(hit)
 
     def refuse(self, plan: replacing.ResultPlan) -> None:
+        """Raise `UsageError` for a file that tacpipe did not write, unless it may be replaced."""
         if self.request.replace or not self.path.is_file() or self.root is not None:
             return
         if not self.store.has(file_digest(self.path)):
@@ -347,6 +358,7 @@ class _File(_Place):
             )
 
     def publish(self, result: Manifest) -> Manifest:
+        """Copy the requested file of ``result`` to the output, and record it as the root of that path."""
         file_name = self._digest(result)
         with directory.changing(self.store, self.path), directory.writing(self.path):
             if not self.path.exists() or file_digest(self.path) != file_name:
@@ -357,7 +369,7 @@ class _File(_Place):
         return result
 
     def _digest(self, result: Manifest) -> str:
-        """Return the digest of the requested file."""
+        """Return the digest of the file with the output's suffix. Raises `UsageError` if the result has none."""
         suffix = self.path.suffix
         matching = next((file["digest"] for name, file in result.files.items() if name.endswith(suffix)), None)
         if matching is None:

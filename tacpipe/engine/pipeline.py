@@ -72,7 +72,7 @@ def run(request: Request) -> Outcome:
     return _conclude(outcome, inputs, result, started)
 
 
-def answered(request: Request) -> Outcome | None:
+def existing_outcome(request: Request) -> Outcome | None:
     """Return the outcome of `run` if there is nothing to do, or None if something must be computed or written.
 
     Raises the errors that `run` would raise before that. Computes and changes nothing.
@@ -125,6 +125,7 @@ class _RequestRun:
     def __init__(
         self, request: Request, store: Store, inputs: RequestInputs, identity: RunIdentity, chosen: ChosenExecutor
     ) -> None:
+        """Prepare a run without changing anything."""
         self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
@@ -187,13 +188,14 @@ class _RequestRun:
         return result
 
     def make(self) -> Manifest:
-        """Compute what is missing and return the result's manifest."""
+        """Compute what is missing and return the result's manifest.
+
+        Raises `TacpipeError` if the stage returned something that a dataset cannot contain.
+        """
         for dataset in self.inputs.used:
             source_manifest = dataset.manifest  # raises if the manifest was edited by hand, before anything is written
-            if self.store.run:
-                source_manifest.keep(
-                    self.store
-                )  # `explain` and `gc` trace a dataset to the manifests that it was computed from
+            if self.store.run:  # `explain` and `gc` trace a dataset to the manifests that it was computed from
+                source_manifest.keep(self.store)
         result = self._make()
         try:
             manifest.check_pages(result, fresh=True)
@@ -202,11 +204,17 @@ class _RequestRun:
         return result
 
     def _make(self) -> Manifest:
+        """Run the stage on whole datasets or by recording, and return the manifest.
+
+        Raises `UsageError` without a recording.
+        """
         request, stage = self.request, self.stage
         empty = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
         if not stage.mapped:
             inputs = {
-                name: self._whole_input(name, kind) for name, kind in stage.arguments.items() if kind != "Workspace"
+                name: self._identity_of_argument(name, kind)
+                for name, kind in stage.arguments.items()
+                if kind != "Workspace"
             }
             identity = keys.identity(request.name, stage.version, request.params, inputs)
             if stage.part is not None:
@@ -214,12 +222,12 @@ class _RequestRun:
                 return replace(empty, files={**files, **self._originals()}, skipped=self._skipped_recordings)
             result = self._run_whole(request.name, identity)
             return replace(empty, chain=self._chain(), recordings=result["recordings"], files=result["files"])
-        fitted = self._fit() if stage.fit else None
+        fitted_files = self._fit() if stage.fit else None
         chain: Sequence[Step] = ()
         recordings: Mapping[str, RecordingEntry] = {}
         if stage.argument("Recording"):
             source = self.inputs.merged
-            step = keys.chain_step(request.name, stage, request.params, fitted)
+            step = keys.chain_step(request.name, stage, request.params, fitted_files)
             recordings = self._by_recording.run_step(source, step, self.inputs.dataset_dirs)
             chain = [*source.chain, step]
         elif tasks := self._own_tasks():
@@ -230,7 +238,7 @@ class _RequestRun:
             empty,
             chain=chain,
             recordings=recordings,
-            files=fitted or {},
+            files=fitted_files or {},
             skipped=self._skipped_recordings,
             sources={name: files for name, files in self.inputs.source_digests.items() if name in recordings},
         )
@@ -278,7 +286,10 @@ class _RequestRun:
 
     @cached_property
     def _parts(self) -> Manifest:
-        """Results of the stage's part for each recording: tables, and files by name."""
+        """Results of the stage's part for each recording: tables, and files by name.
+
+        Raises `UsageError` if there is no recording.
+        """
         source, name = self._source, f"{self.request.name}{registry.PART}"
         assert self.stage.part is not None
         step = keys.chain_step(name, self.stage.part, self.request.params, None)
@@ -306,7 +317,12 @@ class _RequestRun:
                 originals[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
         return originals
 
-    def _whole_input(self, name: str, kind: str) -> Any:
+    def _identity_of_argument(self, name: str, kind: str) -> Any:
+        """Return the part of the key for an argument that is not a single recording, such as a dataset or a model.
+
+        Recordings are replayed through the model's chain, and selected by role if there is a split. Raises `UsageError`
+        for ``--role`` without a split.
+        """
         inputs, reads = self.inputs, self.stage.reads
         if kind == "Model" and name == "init":
             init = inputs.initial_model
@@ -339,7 +355,10 @@ class _RequestRun:
         return keys.of_dataset(source, reads, source.included)
 
     def _roles(self, name: str) -> Any:
-        """Return the identity of the roles of argument ``name``, or None if its option was not given."""
+        """Return the identity of the roles of argument ``name``, or None if its option was not given.
+
+        Raises `UsageError` for ``--fold`` without a split, and for a split of another dataset.
+        """
         dataset = self.inputs.named_datasets.get(name)
         fold = self.request.fold
         if dataset is None:
@@ -354,7 +373,11 @@ class _RequestRun:
         return {"roles": table, "fold": fold}
 
     def _run_whole(self, name: str, identity: StageIdentity, *, counted: bool = True) -> StoredResult:
-        """Return the result of a key over whole datasets, from the store or by running the stage."""
+        """Return the result of a key over whole datasets, from the store or by running the stage.
+
+        Only ``counted`` results count in the outcome. Raises `WouldChangeError` if it is missing and ``--check`` is
+        set, and the error of the stage.
+        """
         self.store.expect([digest(identity)])
         record = self.store.record(digest(identity))
         is_stored = record is not None and records.complete(self.store, record)
@@ -393,7 +416,10 @@ class _RequestRun:
         return result
 
     def _fit(self) -> dict[str, Content]:
-        """Return the files that the stage fitted to the training recordings, or those of ``--codec``."""
+        """Return the files that the stage fitted to the training recordings, or those of ``--codec``.
+
+        Raises `UsageError` if the codec was made by another stage.
+        """
         codec, name, fit = self.inputs.named_datasets.get("codec"), self.request.name, self.stage.fit
         if codec is not None:
             chain = codec.manifest.chain

@@ -52,15 +52,17 @@ class Previous:
 
     def reusable(self, entries: Mapping[str, RecordingEntry], step: Step) -> Reusable | None:
         """Return the reusable results of one stage of a chain for ``entries``, or None if there are none."""
-        before, results = self.source.included, self.result.pages
-        if results is None or not (isinstance(entries, pages.Recordings) and isinstance(before, pages.Recordings)):
+        earlier_entries, results = self.source.included, self.result.pages
+        if results is None or not (
+            isinstance(entries, pages.Recordings) and isinstance(earlier_entries, pages.Recordings)
+        ):
             return None
         if not self._is_same_step(step):
             return None
         now = {page.digest for page in entries.pages.pages}
         firsts = [page.first for page in results.pages] + [""]
         places = {first: number for number, first in enumerate(firsts)}
-        earlier_pages = before.pages.pages
+        earlier_pages = earlier_entries.pages.pages
         followers = [*(page.first for page in earlier_pages[1:]), ""]
         reusable: dict[str, Pages] = {}
         replaced_pages = set(range(len(results)))
@@ -101,6 +103,7 @@ class Previous:
         return self.look.succeed(self.note, head, [*removed, *self.result.files], [*placed, *files])
 
     def _is_same_step(self, step: Step) -> bool:
+        """Return whether the earlier run computed its result by exactly this step from ``source``."""
         result = self.result
         input_digests = [dataset["manifest"] for dataset in result.inputs.get("datasets", ())]
         return (
@@ -113,7 +116,8 @@ class Previous:
     def _summary(self, stage: str, replaced_names: set[str], count: int) -> Summary | None:
         """Return the summary of all results except ``replaced_names``, or None if it is unknown."""
         summary = self.summary
-        codes, packages = (summary.get("code") or {}).get(stage) or {}, summary.get("packages") or {}
+        codes = (summary.get("code") or {}).get(stage) or {}
+        packages = summary.get("packages") or {}
         for counts in filter(None, (codes, *packages.values())):
             if [*counts.values()] != [len(self.result.recordings)]:  # the code that computed each result is unknown
                 return None

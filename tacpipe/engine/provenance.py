@@ -60,7 +60,7 @@ def shared_by(processes: int) -> Iterator[None]:
 
 
 def each_of(processes: int) -> dict[str, str]:
-    """Return the variables that assign each of several processes its part of the cores; empty if they are already set.
+    """Return the variables that assign each of several processes its part of the cores; empty if one is already set.
 
     If each process had as many threads as there are cores, threads would wait for one another.
     """
@@ -96,6 +96,7 @@ def usable_cores() -> int:
 
 @functools.cache
 def _processor() -> Processor:
+    """Return the model of the first core and its instruction sets among `_INSTRUCTIONS`."""
     values: dict[str, str] = {}  # values for the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
@@ -119,6 +120,7 @@ _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
 @functools.cache
 def _environment() -> Provenance:
+    """Return the versions of libraries and Python, the git commit if there is one, and the host."""
     import subprocess
     from importlib.metadata import PackageNotFoundError, version
 
@@ -176,11 +178,14 @@ def unlike(stored: Environment, now: Environment) -> list[str]:
     """
     differences = []
     for name in ("device", "processor", "libraries"):
-        before, after = stored.get(name), now.get(name)
-        if isinstance(before, Mapping) and isinstance(after, Mapping):
-            parts = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]
+        stored_value, current_value = stored.get(name), now.get(name)
+        if isinstance(stored_value, Mapping) and isinstance(current_value, Mapping):
+            parts = [
+                (part, stored_value.get(part), current_value.get(part))
+                for part in sorted({*stored_value, *current_value})
+            ]
         else:
-            parts = [(name, before, after)] if before and after else []
+            parts = [(name, stored_value, current_value)] if stored_value and current_value else []
         differences += [f"{part}: {_text(old)}, now {_text(new)}" for part, old, new in parts if old != new]
     return differences
 

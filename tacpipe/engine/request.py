@@ -102,8 +102,8 @@ class RequestInputs:
             name: manifest.find(path) for name, path in request.named_paths.items() if name in DATASETS
         }
         self.notes: list[str] = []  # warnings for the user
-        self.sources = _discover(self.stage, request)
-        self.source_digests = _hash(self.sources)
+        self.sources = _discover_sources(self.stage, request)
+        self.source_digests = _hash_sources(self.sources)
 
     def identity(self) -> RunIdentity:
         """Return the identity of the run: manifests, params, versions.
@@ -218,7 +218,12 @@ def _model_manifest(dataset: Found) -> Manifest:
     return manifest
 
 
-def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
+def _discover_sources(stage: AnyStage, request: Request) -> dict[str, Source]:
+    """Return the recordings that the stage finds in the source, by name; empty if it reads no source.
+
+    Raises `UsageError` if the source is missing, and the errors of `paths.refuse_shared_names` and
+    `regular.expect_inside`.
+    """
     if not stage.source:
         return {}
     if request.source is None or stage.discover is None:
@@ -236,7 +241,7 @@ def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
     return sources
 
 
-def _hash(sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
+def _hash_sources(sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
     """Return the digests of files and values by recording. Threads would not speed up files of about 100 kB."""
     return {
         name: {

@@ -158,7 +158,7 @@ class LslLink(OpenLink):
             flat = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in rows.ravel()]
             rows = np.array(flat, dtype=object)
         rows = rows.reshape(len(stamps), -1)
-        return lsl.packet(rows, np.asarray(stamps, dtype=np.float64), self._correction)
+        return lsl.pack_samples(rows, np.asarray(stamps, dtype=np.float64), self._correction)
 
     def _measure_clock(self) -> None:
         """Measure the sender's clock repeatedly. This runs in a thread, because each measurement takes a second."""

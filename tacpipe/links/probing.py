@@ -85,7 +85,7 @@ def candidates(data: Chunks, scheme: str) -> list[SensorCandidate]:
             continue
         for options in variants.guess_options(kind, data):
             try:
-                sensors.append(SensorCandidate(kind, params.filled(loaded, options, kind, "option"), options))
+                sensors.append(SensorCandidate(kind, params.build_dataclass(loaded, options, kind, "option"), options))
             except TacpipeError:  # options that cannot be guessed, such as the columns of a generic driver
                 continue
     return sensors

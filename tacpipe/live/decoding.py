@@ -36,13 +36,13 @@ class Decoder:
         return BatchColumns(batch, self._schema, offset_ns, self._places)
 
     def take(self, block: Chunks | StreamNote) -> None:
-        """Store a block."""
+        """Store a block until `batches` decodes it."""
         if isinstance(block, Chunks):
             self.heard_ns = int(block.t_ns[-1])
         if isinstance(block, Chunks) or block.what == LOST:
             self._waiting.append(block)
 
-    def may_hold(self, until_ns: int) -> bool:
+    def may_contain(self, until_ns: int) -> bool:
         """Return whether pending bytes may contain a sample that arrived, or started to arrive, by ``until_ns``."""
         if not self._waiting:
             return False
@@ -51,10 +51,10 @@ class Decoder:
 
     def batches(self) -> list[Batch]:
         """Return the samples that are now complete, decoded as `tacpipe.recording.sealing` will decode them."""
-        waiting, self._waiting = self._waiting, []
+        pending, self._waiting = self._waiting, []
         batches: list[Batch] = []
         chunks: list[Chunks] = []
-        for block in [*waiting, None]:
+        for block in [*pending, None]:
             if isinstance(block, Chunks):
                 chunks.append(block)
                 continue
@@ -71,6 +71,7 @@ class Decoder:
         return [batch for batch in batches if len(batch)]
 
     def _feed(self, chunks: Chunks) -> list[Batch]:
+        """Return the batch in some chunks; if the driver fails, count the failure and return an empty list."""
         try:
             return [self._reading.feed(chunks)]
         except Exception:  # a driver failed; decoding continues with later bytes, as when the recording is sealed
@@ -114,15 +115,15 @@ class BatchColumns:
         return values
 
     def _find_columns(self, numbers: tuple[int, ...]) -> list[Place]:
-        """Return each block that contains some of the columns, which of ``numbers`` these are, and their positions."""
+        """Return the columns' blocks: for each its number, which of ``numbers`` it contains, and their positions in it."""
         if numbers not in self._places:
             ends = np.cumsum([len(self._first), *(block.shape[1] for block in self._blocks)])
             blocks = np.searchsorted(ends, numbers, side="right") - 1  # (column,)
-            self._places[numbers] = [
-                (block, columns, np.array(numbers, np.intp)[columns] - ends[block])
-                for block in np.unique(blocks).tolist()
-                for columns in [np.flatnonzero(blocks == block)]
-            ]
+            places: list[Place] = []
+            for block in np.unique(blocks).tolist():
+                columns = np.flatnonzero(blocks == block)
+                places.append((block, columns, np.array(numbers, np.intp)[columns] - ends[block]))
+            self._places[numbers] = places
         return self._places[numbers]
 
     def table(self) -> pa.Table:
@@ -134,7 +135,7 @@ class BatchColumns:
 
 
 def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
-    """Return the recorded schema of a stream, with device clock and counter columns if present."""
+    """Return the recorded schema of a stream, with a device clock if ``device``, and with the columns ``counters``."""
     import pyarrow as pa
 
     from tacpipe.channels import schema as schemas

@@ -101,10 +101,7 @@ class Engine(ABC):
         return []
 
     def continue_recording(self, beginning: str) -> None:
-        """Restore the JSON state from `Continuation.to_json` of the previous process.
-
-        The next recording continues from it.
-        """
+        """Restore the state, as JSON, of a process that ended; the next recording continues from it."""
         return
 
     def end_recording(self) -> None:

@@ -40,7 +40,10 @@ def live_channels(steps: Sequence[Step], layouts: Mapping[str, pa.Schema]) -> di
 def extracted_streams(
     recording: Recording, steps: Sequence[Step], tables: Mapping[str, pa.Table]
 ) -> dict[str, pa.Table]:
-    """Return the streams of a recording with its cameras replaced by their channels, as the model's stage computes them."""
+    """Return the streams of a recording; cameras are replaced by their channels, as the model's stage computes them.
+
+    Without such a stage or a camera, the streams are unchanged.
+    """
     from tacpipe.plugins import registry
 
     step = next((step for step in steps if step["stage"] in CHANNELS), None)

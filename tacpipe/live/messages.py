@@ -148,7 +148,10 @@ def to_json(content: JsonObject) -> bytes:
 
 
 def packets(message: Message, sensor: Live, seq: int) -> list[bytes]:
-    """Return the packets of a message for one stream, numbered from ``seq``; an empty list if it has no row for it."""
+    """Return the packets of a message for one stream, numbered from ``seq``.
+
+    Returns an empty list if the message has no row for the stream.
+    """
     values = message.stream_blocks(sensor.output)
     if values is None:
         return []
@@ -191,7 +194,9 @@ def _to_json(value: Any, digits: int | None) -> Any:
 
 
 def summarize_latencies(latency_ms: AnyArray) -> dict[str, float]:
-    """Return count, median, 99th percentile, largest, and how many are above 10 and 20 ms; without values only the count.
+    """Return figures of latencies: count, median, 99th percentile, maximum, and how many are above 10 and 20 ms.
+
+    Without values, only the count is returned.
 
     >>> summarize_latencies(np.array([1.0, 2.0, np.nan, 12.0]))["above_10_ms"]
     1

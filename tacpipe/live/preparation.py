@@ -66,10 +66,10 @@ def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
     settings = Settings.from_sources(model.live.settings, rig.live, rig_file, parsed)
     if settings.realtime:
         with settings.naming("realtime"):
-            wire.check()
+            wire.check_realtime()
     with settings.naming("publish"):
         for address in settings.publish:
-            publishing.check(address)
+            publishing.parse_publish_address(address)
     plan = model.live.plan(model.dataset, rig, settings)
     streams = {name: {"task": model.task, "output": name, **options} for name, options in plan.streams.items()}
     complete_rig = add_streams(recorder.complete_rig(plan.rig), streams)
@@ -94,7 +94,7 @@ def open_model(path: str) -> LiveModel:
 
 
 def with_absolute_paths(settings: Settings) -> Settings:
-    """Return settings with absolute paths."""
+    """Return settings in which the paths of the model and of the task's files are absolute."""
     task = {
         name: str(Path(getattr(settings.task, name)).absolute())
         for name in PATHS
@@ -113,13 +113,13 @@ def add_streams(rig: Rig, streams: Mapping[str, Options]) -> Rig:
         raise UsageError(
             f"The rig file has a stream {conflicting[0]}, as a live session adds itself; give it another name."
         )
-    added = {
+    new_streams = {
         name: RigStream(
             name, "live", rigs.build_sensor("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)
         )
         for (name, options), port in zip(streams.items(), free_ports(len(streams)), strict=True)
     }
-    extended = replace(rig, streams={**rig.streams, **added})
+    extended = replace(rig, streams={**rig.streams, **new_streams})
     return replace(extended, text=rigs.to_toml(extended))
 
 

@@ -63,8 +63,8 @@ class Latencies:
         """
         if not self.count:
             return 0.0
-        place = int(np.searchsorted(np.cumsum(self._bins), math.ceil(fraction * self.count)))
-        return min(SHORTEST_MS * 10 ** ((place + 1) / PER_DECADE), self.max_ms)
+        bin_index = int(np.searchsorted(np.cumsum(self._bins), math.ceil(fraction * self.count)))
+        return min(SHORTEST_MS * 10 ** ((bin_index + 1) / PER_DECADE), self.max_ms)
 
     def above(self, limit_ms: float) -> int:
         """Return the number of longer latencies, to the width of a bin."""
@@ -114,7 +114,7 @@ class Loop:
         self.report()
 
     def publish(self, message: Message) -> None:
-        """Send a message to all subscribers and record its latency."""
+        """Send a message to all subscribers, and count it and its latency if it is an answer of the model."""
         self.publishers.publish(message, lambda sent: self.engine.published(sent, time.monotonic_ns()))
         self.cause = message.cause
         if message.answers:
@@ -138,13 +138,14 @@ class Loop:
             "above_10_ms": self.latencies.above(10.0),
             "above_20_ms": self.latencies.above(20.0),
         }
-        send(self.connection, {"report": figures})
+        send_line(self.connection, {"report": figures})
         beginning = self.engine.beginning if self.engine.running else None
         if beginning is not None and beginning != self._reported:
-            send(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
+            send_line(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
         self._reported = beginning
 
     def _fetch(self) -> None:
+        """Process all received blocks; the session ends if the recording process asks for it or has ended."""
         while True:
             try:
                 data = self.connection.recv(FETCH_BYTES)
@@ -161,7 +162,7 @@ class Loop:
                 self.engine.take(stream, block)
 
 
-def send(connection: socket.socket, content: wire.ModelLine) -> None:
+def send_line(connection: socket.socket, content: wire.ModelLine) -> None:
     """Send a line to the recording process, unless it does not read or has ended."""
     try:
         connection.send(wire.line(content))
@@ -189,13 +190,13 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     """Run the model's process on an inherited socket with the given number; return its exit code."""
     connection = socket.socket(fileno=int(arguments[0]))
     connection.setblocking(True)
-    options = SessionOptions.from_json(_first_line(connection))
+    options = SessionOptions.from_json(_read_first_line(connection))
     try:
         with extras.explain_missing("tacpipe live"):
             engine = engine_for(options)
             publishers = publishing.open_publishers(options, engine.describe(options.settings.model))
     except TacpipeError as error:
-        send(connection, {"refused": str(error), "exit_code": error.exit_code})
+        send_line(connection, {"refused": str(error), "exit_code": error.exit_code})
         return REFUSED
     gc.collect()
     gc.freeze()
@@ -204,7 +205,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     sys.setswitchinterval(SWITCH_S)
     if options.settings.realtime:
         wire.realtime(wire.MODEL)
-    send(connection, {"ready": True, "alarms": engine.alarm_levels()})
+    send_line(connection, {"ready": True, "alarms": engine.alarm_levels()})
     from tacpipe.models.tensors import one_thread  # imports torch, which the engine has already loaded
 
     with publishers, one_thread():  # set once, not in each forecast
@@ -212,7 +213,8 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     return 0
 
 
-def _first_line(connection: socket.socket) -> str:
+def _read_first_line(connection: socket.socket) -> str:
+    """Return the first line, which has the options. Exits if the connection is closed before its end."""
     text = b""
     while not text.endswith(b"\n"):
         select.select([connection], [], [])

@@ -50,9 +50,9 @@ class Publisher(Protocol):
 class StreamPublisher:
     """The packets that the recording process reads as streams of the rig."""
 
-    def __init__(self, places: Mapping[str, tuple[str, int]], sensors: Mapping[str, Live]) -> None:
+    def __init__(self, addresses: Mapping[str, tuple[str, int]], sensors: Mapping[str, Live]) -> None:
         self.dropped = 0
-        self._places, self._sensors = places, sensors
+        self._addresses, self._sensors = addresses, sensors
         self._sent = dict.fromkeys(sensors, 0)  # number of packets sent per stream
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -63,7 +63,7 @@ class StreamPublisher:
             for packet in packets(message, sensor, self._sent[output]):
                 self._sent[output] = (self._sent[output] + 1) % (1 << 32)
                 try:
-                    self._socket.sendto(packet, self._places[output])
+                    self._socket.sendto(packet, self._addresses[output])
                 except OSError:
                     self.dropped += 1
 
@@ -91,7 +91,10 @@ class Publishers:
         return sum(publisher.dropped for publisher in self._publishers)
 
     def publish(self, message: Message, stamp: Callable[[Message], None]) -> None:
-        """Send a message to all; ``stamp`` writes its current latency into it."""
+        """Send a message to all subscribers and record it in the session's own streams.
+
+        ``stamp`` writes the current latency into the message; it is called for both.
+        """
         stamp(message)
         for subscriber in self._subscribed:
             subscriber.publish(message)
@@ -117,57 +120,58 @@ def open_publishers(options: SessionOptions, about: Description) -> Publishers:
     Raises `UsageError` for an unsupported address, `DeviceError` for one in use.
     """
     rig = rigs.parse(options.rig)
-    places: dict[str, tuple[str, int]] = {}
+    addresses: dict[str, tuple[str, int]] = {}
     sensors: dict[str, Live] = {}
     for name in options.own_streams:
         stream = rig.streams[name]
         assert isinstance(stream.sensor, Live)
         host, _, port = stream.address.target.partition("?")[0].rpartition(":")
-        places[name], sensors[name] = (host or "127.0.0.1", int(port)), stream.sensor
-    subscribed: list[Publisher] = []
+        addresses[name], sensors[name] = (host or "127.0.0.1", int(port)), stream.sensor
+    subscribers: list[Publisher] = []
     try:
-        subscribed.extend(publisher(address, about) for address in options.settings.publish)
+        subscribers.extend(publisher(address, about) for address in options.settings.publish)
     except BaseException:
-        for opened in subscribed:
+        for opened in subscribers:
             opened.close()
         raise
-    return Publishers(subscribed, StreamPublisher(places, sensors) if sensors else None, about)
+    return Publishers(subscribers, StreamPublisher(addresses, sensors) if sensors else None, about)
 
 
 def publisher(address: str, about: Description) -> Publisher:
     """Return the publisher of an address. Raises `UsageError` and `DeviceError` as `open_publishers` does."""
-    scheme, place = check(address)
+    scheme, location = parse_publish_address(address)
     if scheme == "ws":
         with extras.explain_missing("--publish ws"):
             from tacpipe.live.websocket import WebsocketPublisher
 
-        return WebsocketPublisher(place, about)
+        return WebsocketPublisher(location, about)
     if scheme == "udp":
-        return UdpPublisher(place, about)
-    return LslPublisher(place, about) if scheme == "lsl" else McapPublisher(place, about)
+        return UdpPublisher(location, about)
+    return LslPublisher(location, about) if scheme == "lsl" else McapPublisher(location, about)
 
 
-def check(address: str) -> tuple[str, str]:
+def parse_publish_address(address: str) -> tuple[str, str]:
     """Return scheme and location of an address. Raises `UsageError` if it is not supported."""
-    scheme, colon, place = address.partition(":")
-    if scheme not in EXAMPLES or not colon or not place:
+    scheme, colon, location = address.partition(":")
+    if scheme not in EXAMPLES or not colon or not location:
         raise UsageError(
             f"--publish {excerpt(address)} is not an address; it should read like one of these: "
             f"{'; '.join(EXAMPLES.values())}."
         )
-    return scheme, place
+    return scheme, location
 
 
 class LslPublisher:
     """Publishes to an LSL outlet, which drops the oldest unread messages instead of waiting for readers."""
 
-    def __init__(self, place: str, about: Description) -> None:
+    def __init__(self, name: str, about: Description) -> None:
+        """Open an outlet of the Lab Streaming Layer. Raises `MissingModuleError` without pylsl."""
         with extras.explain_missing("--publish lsl"):
             import pylsl
         lsl.silence_logging(pylsl)
         columns = about.columns()
         info = pylsl.StreamInfo(
-            place, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{place}"
+            name, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{name}"
         )
         channels = info.desc().append_child("channels")
         for name, unit in columns:
@@ -190,17 +194,18 @@ class LslPublisher:
 class McapPublisher:
     """Writes a new MCAP file."""
 
-    def __init__(self, place: str, about: Description) -> None:
+    def __init__(self, file_name: str, about: Description) -> None:
+        """Create a file, and write it in a thread. Raises `UsageError` if it exists or cannot be created."""
         with extras.explain_missing("--publish mcap"):
             from mcap.writer import Writer
 
-        path = Path(place)
+        path = Path(file_name)
         try:
             self._file = path.open("xb")
         except FileExistsError:
-            raise UsageError(f"--publish mcap:{place}: the file exists already; give another name.") from None
+            raise UsageError(f"--publish mcap:{file_name}: the file exists already; give another name.") from None
         except OSError as error:
-            raise UsageError(f"--publish mcap:{place}: {error.strerror}.") from error
+            raise UsageError(f"--publish mcap:{file_name}: {error.strerror}.") from error
         self.dropped = 0
         self._writer = Writer(self._file)
         self._writer.start(profile="", library="tacpipe")
@@ -231,6 +236,7 @@ class McapPublisher:
         self._file.close()
 
     def _write(self) -> None:
+        """Write queued messages, with the description before the first, until None arrives."""
         while (entry := self._waiting.get()) is not None:
             t_ns, message = entry
             if self._about is not None:
@@ -243,20 +249,24 @@ class UdpPublisher:
     """Sends each message to one address."""
 
     def __init__(self, place: str, about: Description) -> None:
-        place, _, options = place.partition("?")
+        """Open a socket to ``HOST:PORT``, with the option ``?format=msgpack``.
+
+        Raises `UsageError` for another option, `DeviceError` if the address cannot be reached.
+        """
+        target, _, options = place.partition("?")
         parsed = dict(parse_qsl(options, keep_blank_values=True))
         kind = parsed.pop("format", "json")
         if parsed or kind not in FORMATS:
-            raise UsageError(f"--publish udp:{place}?{excerpt(options)}: the only option is format, json or msgpack.")
+            raise UsageError(f"--publish udp:{target}?{excerpt(options)}: the only option is format, json or msgpack.")
         self.dropped = 0
         self._packed = to_json if kind == "json" else _msgpack()
-        host, port = network.parse_host_port("udp", place)
+        host, port = network.parse_host_port("udp", target)
         try:
-            family, *_, target = socket.getaddrinfo(host or "127.0.0.1", port, type=socket.SOCK_DGRAM)[0]
+            family, *_, address = socket.getaddrinfo(host or "127.0.0.1", port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
-            self._socket.connect(target)
+            self._socket.connect(address)
         except OSError as error:
-            raise DeviceError(f"--publish udp:{place}: {error.strerror or error}.") from error
+            raise DeviceError(f"--publish udp:{target}: {error.strerror or error}.") from error
         self._socket.setblocking(False)
         self._about = self._packed(about.to_dict())
         self._until_about = 0
@@ -270,6 +280,7 @@ class UdpPublisher:
         self._send(self._packed(message.to_dict()))
 
     def _send(self, data: bytes) -> None:
+        """Send a datagram; count it as dropped if it is too large or the network does not accept it."""
         try:
             if len(data) > MAX_DATAGRAM_BYTES:
                 raise OSError
@@ -283,11 +294,12 @@ class UdpPublisher:
 
 
 def _msgpack() -> Callable[[JsonObject], bytes]:
+    """Return a function that encodes a message as msgpack. Raises `MissingModuleError` without that package."""
     with extras.explain_missing("--publish udp with format=msgpack"):
         import msgpack
 
-    def packed(content: JsonObject) -> bytes:
+    def encode(content: JsonObject) -> bytes:
         datagram: bytes = msgpack.packb(content)
         return datagram
 
-    return packed
+    return encode

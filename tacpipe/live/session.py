@@ -37,7 +37,10 @@ SWITCH_S = 0.0005  # maximum time that a thread delays another; reading threads 
 
 @contextlib.contextmanager
 def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[], bool]) -> Iterator[Supervisor]:
-    """Run the model's process on a rig's data within the block. Raises the error with which it rejects the session."""
+    """Run the model's process on a rig's data within the block, and yield its supervisor.
+
+    Raises the error with which the process rejects the session.
+    """
     supervisor = Supervisor(options, RecorderTap(options.streams))
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
@@ -53,10 +56,10 @@ def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[],
         sys.setswitchinterval(before_s)
 
 
-def lines(figures: SessionFigures) -> list[str]:
+def describe_figures(figures: SessionFigures) -> list[str]:
     """Return the progress of a session in words.
 
-    >>> lines({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
+    >>> describe_figures({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
     ...     "states": {"load": "off", "slip": "unknown"},
     ...     "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
     ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
@@ -142,14 +145,17 @@ class Supervisor:
         self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[StreamNote]:
-        """Read the process's reports and restart it if it has ended; return notes on that. Never raises and never waits."""
+        """Read the process's reports and restart it if it has ended; return notes on that.
+
+        Never raises and never waits.
+        """
         self.tap.flush()
         self._read()
         notes = []
         if self._process is not None and self._process.poll() is not None:
             code = self._process.returncode
             self.deaths += 1
-            self._forget()
+            self._discard_process()
             self._due_s = clock.now_s() + self._restart_s
             self._restart_s = min(2 * self._restart_s, RESTART_S[1])
             notes.append(StreamNote(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
@@ -190,27 +196,31 @@ class Supervisor:
         return figures
 
     def _spawn(self) -> None:
+        """Start the model's process, and pass it the options and, during a recording, the state from which it continues."""
         ours, theirs = socket.socketpair()
         threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more threads would only compete with the recorder
         environment = {**os.environ, **threads}
-        words = [sys.executable, "-m", MODULE, str(theirs.fileno())]
+        command = [sys.executable, "-m", MODULE, str(theirs.fileno())]
         try:
             self._process = subprocess.Popen(
-                words, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+                command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
             )
         finally:
             theirs.close()
         self._socket, self._lines, self.ready = ours, wire.LineCutter(), False
         ours.sendall(self.options.to_json().encode())
         ours.setblocking(False)
-        first = [] if self._offset_ns is None else [StreamNote(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
-        if first and self._beginning is not None:
-            first.insert(0, StreamNote(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
-        self.tap.connect(ours, *first)
-        if first:
+        first_notes = (
+            [] if self._offset_ns is None else [StreamNote(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        )
+        if first_notes and self._beginning is not None:
+            first_notes.insert(0, StreamNote(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
+        self.tap.connect(ours, *first_notes)
+        if first_notes:
             self.tap.put_begins()
 
-    def _forget(self) -> None:
+    def _discard_process(self) -> None:
+        """Close the connection to a process that has ended, and add its counts to the totals."""
         self.tap.connect(None)
         if self._socket is not None:
             self._socket.close()
@@ -222,6 +232,7 @@ class Supervisor:
             self.report["latency"] = before["latency"]
 
     def _read(self) -> None:
+        """Process the lines that the process has sent; never waits."""
         if self._socket is None:
             return
         while True:

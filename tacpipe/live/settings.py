@@ -75,11 +75,11 @@ class Settings:
         `UsageError`, which names file and key, or the option, for an unknown key, an invalid value, and an invalid
         combination.
         """
-        options = {name: value for name, value in options.items() if value is not None}
+        given_options = {name: value for name, value in options.items() if value is not None}
         common = {name: kind for name, kind in fields.hints(cls).items() if name not in NOT_SET}
         task_fields = fields.hints(task_settings)
         allowed = {**common, **task_fields}
-        for name, value in options.items():
+        for name, value in given_options.items():
             if name not in allowed:
                 raise UsageError(
                     f"This model has no setting {option(name)}; there are {', '.join(map(option, allowed))}."
@@ -88,12 +88,14 @@ class Settings:
         for name in file_settings:
             if name not in allowed:
                 raise fields.unknown(name, allowed, f"{rig_file}, live", "key")
-        file_settings = task_settings.override(file_settings, options)
-        places = {name: f"{rig_file}, live" for name in file_settings if name not in options}
-        values = {**{name: value for name, value in file_settings.items() if name not in options}, **options}
-        filled_from = f"{rig_file}, live"
-        task = params.filled(task_settings, {n: v for n, v in values.items() if n in task_fields}, filled_from, "key")
-        base = params.filled(cls, {n: v for n, v in values.items() if n in common}, filled_from, "key")
+        source = f"{rig_file}, live"
+        used_settings = task_settings.override(file_settings, given_options)
+        places = {name: source for name in used_settings if name not in given_options}
+        values = {**used_settings, **given_options}
+        task = params.build_dataclass(
+            task_settings, {n: v for n, v in values.items() if n in task_fields}, source, "key"
+        )
+        base = params.build_dataclass(cls, {n: v for n, v in values.items() if n in common}, source, "key")
         settings: Self = replace(base, task=task, places=places)
         task.check(settings)
         return settings
@@ -167,9 +169,9 @@ def parse_option(name: str, text: Any, annotation: Any) -> Any:
     if not isinstance(text, str):
         return text
     kind = fields.bare(annotation)
-    value: Any = fields.parsed(text, annotation)
+    value: Any = fields.parse_text(text, annotation)
     if get_origin(kind) is tuple:
-        value = tuple(fields.parsed(part, get_args(kind)[0]) for part in text.split(",")) if text else ()
+        value = tuple(fields.parse_text(part, get_args(kind)[0]) for part in text.split(",")) if text else ()
     return fields.check(value, annotation, option(name))
 
 
@@ -203,10 +205,10 @@ class LiveTask(ABC):
 
     @abstractmethod
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
-        """Return the plan of a session from the model's configuration, without torch.
+        """Return the plan of a session from the model's configuration, without importing torch.
 
-        Raises `UsageError` for settings that do not match model or rig, `TacpipeError` if the model was trained on rows
-        that look ahead, unless the settings allow it.
+        Raises `UsageError` for settings that do not match model or rig, and `TacpipeError` if the model was trained on
+        rows that look ahead, unless the settings allow it.
         """
 
     @abstractmethod

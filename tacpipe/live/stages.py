@@ -73,7 +73,7 @@ class RecordingsInMemory:
 
 
 def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
-    """Return the streams of a recording. Raises `UsageError` if it has already been synchronized."""
+    """Return the streams of a recording. Raises `UsageError` if a stage has already processed it."""
     if set(recording.streams) == {""}:
         raise UsageError(
             "this recording already went through a stage, so the arrival of its samples is unknown. Give the "
@@ -83,12 +83,12 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
 
 
 def run_stages(recording: Recording, model: Dataset) -> Any:
-    """Return a recorded, unprocessed recording after the stages of a model's chain."""
-    current: Any = recording
+    """Return a recording, as recorded, after the stages of a model's chain."""
+    processed: Any = recording
     for step in model.source.chain:
         stage = registry.load(step["stage"])
         arguments = {
-            name: current if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
+            name: processed if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
             for name, kind in stage.arguments.items()
         }
         returned = stage(params.from_json(stage, step["params"]), **arguments)
@@ -96,5 +96,5 @@ def run_stages(recording: Recording, model: Dataset) -> Any:
         tables = {
             name: table.read_all() if hasattr(table, "read_all") else table for name, table in output.streams.items()
         }
-        current = RecordingInMemory(recording.name, tables, {**current.attributes, **output.attributes})
-    return current
+        processed = RecordingInMemory(recording.name, tables, {**processed.attributes, **output.attributes})
+    return processed

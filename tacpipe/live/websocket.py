@@ -57,19 +57,23 @@ class WebsocketPublisher:
     """
 
     def __init__(self, place: str, about: Description) -> None:
-        place, _, options = place.partition("?")
+        """Start a server at ``HOST:PORT``, with any number of ``origin`` options.
+
+        Raises `UsageError` for other options, and the errors of `_listening_socket`.
+        """
+        target, _, options = place.partition("?")
         origins = parse_qsl(options, keep_blank_values=True)
         if any(name != "origin" or not value for name, value in origins):
             raise UsageError(
-                f"--publish ws:{place}?{excerpt(options)}: the only option is origin, as in "
-                f"ws:{place}?origin=http://localhost:3000."
+                f"--publish ws:{target}?{excerpt(options)}: the only option is origin, as in "
+                f"ws:{target}?origin=http://localhost:3000."
             )
         self.dropped = 0
         self._about = to_json(about.to_dict()).decode()
         self._token = os.environ.get(TOKEN, "")
         self._connections: set[ServerConnection] = set()
         self._subscribers: dict[ServerConnection, int] = {}  # messages in a row that each missed
-        listening = _listening_socket(place)
+        listening = _listening_socket(target)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="websocket", daemon=True)
         self._thread.start()
@@ -98,11 +102,12 @@ class WebsocketPublisher:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
     async def _serve(self, listening: socket.socket, origins: list[str]) -> Server:
+        """Start the server on a listening socket, for pages of these ``origins`` and for programs."""
         return await serve(
             self._subscribe,
             sock=listening,
             origins=[None, *map(Origin, [*own_origins(listening), *origins])],
-            process_request=self._answer,
+            process_request=self._check_request,
             compression=None,
             open_timeout=OPEN_S,
             close_timeout=END_S,
@@ -112,6 +117,7 @@ class WebsocketPublisher:
         )
 
     async def _end(self) -> None:
+        """Close the server, and abort connections that do not close within `END_S`."""
         self._server.close()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(END_S):
@@ -119,7 +125,7 @@ class WebsocketPublisher:
         for connection in self._connections:
             connection.transport.abort()
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return a refusal for a client without the token, the page for a browser, and None for a subscriber.
 
         The token is a header or part of the address.
@@ -146,7 +152,10 @@ class WebsocketPublisher:
             del self._subscribers[connection]
 
     def _send(self, text: str) -> None:
-        """Send a message to the subscribers for which few others wait. Runs in the server's thread."""
+        """Send a message to the subscribers that are not behind, in the server's thread.
+
+        Others miss it; a subscriber that missed `BEHIND` messages in a row is cut off.
+        """
         backlog_bytes = min(QUEUED * len(text), QUEUED_BYTES)
         ready = []
         for connection, missed in self._subscribers.items():
@@ -172,14 +181,14 @@ def own_origins(listening: socket.socket) -> list[str]:
     return [f"http://{name}:{port}" for name in dict.fromkeys(hosts)]
 
 
-def _listening_socket(place: str) -> socket.socket:
+def _listening_socket(target: str) -> socket.socket:
     """Return a socket that listens at ``HOST:PORT``. Raises `UsageError` for no port, `DeviceError` for one in use."""
-    host, port = network.parse_host_port("ws", place)
+    host, port = network.parse_host_port("ws", target)
     try:
         family, *_, address = socket.getaddrinfo(host or HOST, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server(address, family=family)
     except OSError as error:
-        raise DeviceError(f"--publish ws:{place}: {error.strerror or error}. Take another port.") from error
+        raise DeviceError(f"--publish ws:{target}: {error.strerror or error}. Take another port.") from error
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SENDING_BYTES)  # connections inherit it
     return listening
 

@@ -37,7 +37,7 @@ STOP = "stop"  # the session ends
 QUEUED_BYTES = 8 << 20  # maximum size of the queue, enough for many seconds of a rig
 
 
-def block(stream: int | None, content: Chunks | StreamNote) -> bytes:
+def pack_block(stream: int | None, content: Chunks | StreamNote) -> bytes:
     """Return an encoded block; ``stream`` is the number of its stream, or None for a note on all streams."""
     if isinstance(content, Chunks):
         body = content.t_ns.astype("<i8").tobytes() + content.size.astype("<u4").tobytes() + content.data
@@ -59,22 +59,22 @@ class Blocks:
         Raises `TacpipeError` for invalid bytes, which come from a process of another version.
         """
         self._text += data
-        place = 0
-        while place + HEAD.size <= len(self._text):
-            mark, _, kind, number, _, count, size = HEAD.unpack_from(self._text, place)
+        offset = 0
+        while offset + HEAD.size <= len(self._text):
+            mark, _, kind, number, _, count, size = HEAD.unpack_from(self._text, offset)
             if mark != MARK:
                 raise TacpipeError(
                     "The recording process sent invalid data. Check that both run the same version of tacpipe."
                 )
-            stop = place + HEAD.size + size
+            stop = offset + HEAD.size + size
             if stop > len(self._text):
                 break
             stream = "" if number == WHOLE else self._streams[number]
-            content = spool.unpack_block(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
-            place = stop
+            content = spool.unpack_block(kind, stream, count, bytes(self._text[offset + HEAD.size : stop]))
+            offset = stop
             if content is not None:
                 yield stream, content
-        del self._text[:place]
+        del self._text[:offset]
 
 
 class AlarmsJson(TypedDict):
@@ -146,11 +146,11 @@ def line(content: ModelLine) -> bytes:
 class RecorderTap:
     """The recorder's side of the connection to the model's process, which can be replaced while in use."""
 
-    def __init__(self, streams: Sequence[str], most_bytes: int = QUEUED_BYTES) -> None:
+    def __init__(self, streams: Sequence[str], max_bytes: int = QUEUED_BYTES) -> None:
         self.overflows = 0  # number of times that the queue was dropped
         self.bytes_lost = 0
         self._numbers: Mapping[str, int] = {name: number for number, name in enumerate(streams)}
-        self._most_bytes = most_bytes
+        self._most_bytes = max_bytes
         self._keeping = threading.Lock()
         self._connection: socket.socket | None = None
         self._waiting: deque[memoryview] = deque()
@@ -165,19 +165,19 @@ class RecorderTap:
             if connection is not None:
                 connection.setblocking(False)
             for note in first:
-                self._append(block(None, note))
+                self._append(pack_block(None, note))
 
     def put(self, stream: str, content: Chunks | StreamNote) -> None:
         """Send a block of a stream, or a note on it. Thread-safe."""
         with self._keeping:
             if self._connection is not None:
-                self._append(block(self._numbers[stream], content))
+                self._append(pack_block(self._numbers[stream], content))
 
     def note(self, note: StreamNote) -> None:
         """Send a note on all streams."""
         with self._keeping:
             if self._connection is not None:
-                self._append(block(None, note))
+                self._append(pack_block(None, note))
 
     def put_begins(self) -> None:
         """Send the note that each stream begins, for a process started during a recording."""
@@ -190,23 +190,25 @@ class RecorderTap:
             self._send()
 
     def _append(self, data: bytes) -> None:
+        """Queue data, after dropping the queue if it is too long, and send what the socket accepts."""
         if self._waiting_bytes + len(data) > self._most_bytes:
-            self._overflow()
+            self._drop_queue()
         self._waiting.append(memoryview(data))
         self._waiting_bytes += len(data)
         self._send()
 
-    def _overflow(self) -> None:
+    def _drop_queue(self) -> None:
         """Drop the queue, except the rest of a partially sent block."""
         is_partly_sent = len(self._waiting) > 0 and self._waiting[0].nbytes < len(self._waiting[0].obj)  # type: ignore[arg-type]
         retained = [self._waiting[0]] if is_partly_sent else []
         self.overflows += 1
         self.bytes_lost += self._waiting_bytes - sum(part.nbytes for part in retained)
-        note = memoryview(block(None, StreamNote(clock.now_ns(), "", OVERFLOW)))
+        note = memoryview(pack_block(None, StreamNote(clock.now_ns(), "", OVERFLOW)))
         self._waiting = deque([*retained, note])
         self._waiting_bytes = sum(part.nbytes for part in self._waiting)
 
     def _send(self) -> None:
+        """Send queued data until the socket accepts no more."""
         while self._waiting and self._connection is not None:
             try:
                 sent = self._connection.send(self._waiting[0])
@@ -225,7 +227,7 @@ class RecorderTap:
 RECORDER, MODEL = 20, 10  # priorities, so that the recording never waits for the model
 
 
-def check() -> None:
+def check_realtime() -> None:
     """Raise `UsageError` if the system does not allow real-time scheduling."""
     try:
         _set(0, RECORDER)

@@ -30,7 +30,7 @@ _LOOKS = 100  # attempts if other pushes of the same name come first
 
 def named_store(remote: Path | str) -> AnyStore:
     """Return the store at a path or an address, whether or not it exists. Raises `UsageError` for an invalid address."""
-    address = addresses.parsed(str(remote))
+    address = addresses.parse_address(str(remote))
     if isinstance(address, Path):
         return Store(files.local(address).absolute())
     return RemoteStore(Bucket(address))

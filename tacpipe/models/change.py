@@ -8,6 +8,7 @@ effective for time series forecasting? (2023), call direct multi-step.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,7 +40,11 @@ class ChangeForecast(nn.Module):
     def __init__(
         self, features: int, *, dropout: float, loss: str, context: int, horizon: int, increments: bool = False
     ) -> None:
-        """Initialise all scales to 1. Sizes are numbers of features and of rows."""
+        """Initialise all scales to 1.
+
+        ``features``, ``context`` and ``horizon`` are numbers of features and rows; ``increments``: features are already
+        differences.
+        """
         super().__init__()
         self.features, self.context, self.horizon = features, context, horizon
         self.kind, self.increments = loss, increments
@@ -61,7 +66,10 @@ class ChangeForecast(nn.Module):
         self.motion_scale.copy_(_scale(spread(steps)))
 
     def loss(self, windows: ForecastWindows, ahead: Tensor) -> Tensor:
-        """Return the mean error relative to the RMS change: absolute, squared, or Huber's."""
+        """Return the mean error relative to the RMS change: absolute, squared, or Huber's, by ``kind``.
+
+        ``ahead`` is (horizon, window, feature).
+        """
         predicted, truth = self(windows) / self.change_scale, ahead / self.change_scale
         if self.kind == "squared":
             return nn.functional.mse_loss(predicted, truth)
@@ -135,23 +143,23 @@ class SequenceForecast(ChangeForecast):
 
     def forward(self, windows: ForecastWindows) -> Tensor:
         """Return the predicted features (horizon, window, feature), in their own unit."""
-        read, plan = self.inputs(windows)
+        past, plan = self.inputs(windows)
         if self.cell == "tcn":
-            states = self._convolve(read, plan)
+            states = self._convolve(past, plan)
         else:
-            states, _ = lstm.run_layer(self.decoder, plan, lstm.run_layer(self.encoder, read)[1])
+            states, _ = lstm.run_layer(self.decoder, plan, lstm.run_layer(self.encoder, past)[1])
         return self.to_touch(self.head(self.drop(states)), windows)
 
-    def _convolve(self, read: Tensor, plan: Tensor) -> Tensor:
-        """Return the states of the predicted steps, (horizon, window, hidden)."""
-        missing = plan.new_zeros(*plan.shape[:2], read.shape[-1] - plan.shape[-1])
-        rows = torch.cat([read, torch.cat([missing, plan], -1)])
-        is_past = torch.cat([rows.new_ones(len(read)), rows.new_zeros(len(plan))])
+    def _convolve(self, past: Tensor, plan: Tensor) -> Tensor:
+        """Return the states of the predicted steps (horizon, window, hidden) from past and plan, padded to equal width."""
+        missing = plan.new_zeros(*plan.shape[:2], past.shape[-1] - plan.shape[-1])
+        rows = torch.cat([past, torch.cat([missing, plan], -1)])
+        is_past = torch.cat([rows.new_ones(len(past)), rows.new_zeros(len(plan))])
         is_past = is_past[:, None, None].expand(-1, rows.shape[1], -1)
         signal = self.inward(torch.cat([rows, is_past], -1)).permute(1, 2, 0)  # (window, hidden, row)
         for block in self.blocks:
             signal = block(signal)
-        states: Tensor = signal.permute(2, 0, 1)[len(read) :]
+        states: Tensor = signal.permute(2, 0, 1)[len(past) :]
         return states
 
 
@@ -221,12 +229,12 @@ class TaxelwiseForecast(ChangeForecast):
         super().__init__(len(layout), **shared)
         self.sensors, self.taxels, self.axes = grid(layout)
         self.lags = [lag for lag in LAGS if lag < self.context]
-        own = 2 * (len(self.lags) + 1) * self.axes
-        whole = self.sensors * 2 * (len(self.lags) + 1) * self.axes
-        inputs = whole + UP + self.context * (MOTION + 2)
+        own_inputs = 2 * (len(self.lags) + 1) * self.axes
+        whole_inputs = self.sensors * 2 * (len(self.lags) + 1) * self.axes
+        inputs = whole_inputs + UP + self.context * (MOTION + 2)
         self.register_buffer("axis_scale", torch.ones(self.axes))
-        self.register_buffer("own_mean", torch.zeros(own))
-        self.register_buffer("own_scale", torch.ones(own))
+        self.register_buffer("own_mean", torch.zeros(own_inputs))
+        self.register_buffer("own_scale", torch.ones(own_inputs))
         self.register_buffer("told_mean", torch.zeros(inputs))
         self.register_buffer("told_scale", torch.ones(inputs))
         self.whole = nn.Sequential(
@@ -234,7 +242,7 @@ class TaxelwiseForecast(ChangeForecast):
         )
         # Drawn on the CPU even if weights are loaded: torch.randn on the meta device imports sympy, which takes 0.3 s
         self.traits = nn.Parameter(0.3 * torch.randn(self.sensors * self.taxels, TRAITS, device="cpu"))
-        self.own, self.from_whole = nn.Linear(own, hidden), nn.Linear(hidden, hidden)
+        self.own, self.from_whole = nn.Linear(own_inputs, hidden), nn.Linear(hidden, hidden)
         self.from_traits = nn.Linear(TRAITS, hidden)
         self.mixing = nn.Linear(hidden, hidden)
         self.factors = nn.Linear(hidden, self.axes * RANK)
@@ -269,11 +277,11 @@ class TaxelwiseForecast(ChangeForecast):
         hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._dropout_mask(hidden)))
         hidden = hidden * self._dropout_mask(hidden)
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
-        new = self._novelty(windows)
+        is_new = self._novelty(windows)
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
-        inputs = torch.cat([plan, new.expand(len(plan), -1, -1)], -1)
+        inputs = torch.cat([plan, is_new.expand(len(plan), -1, -1)], -1)
         states, _ = lstm.run_layer(self.plan, inputs, self.start(whole)[None])
-        steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(new)).T[..., None]
+        steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(is_new)).T[..., None]
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
         return self.to_touch(change.flatten(2), windows)
 
@@ -291,7 +299,7 @@ class TaxelwiseForecast(ChangeForecast):
         return mask
 
     def _network_inputs(self, windows: ForecastWindows) -> tuple[Tensor, Tensor]:
-        """Return the inputs of each taxel (window, taxel, …) and of the shared network (window, …)."""
+        """Return the inputs of each taxel (window, taxel, …), and of the network that all taxels share (window, …)."""
         touch = windows.touch
         lags = torch.tensor([windows.context - 1 - lag for lag in self.lags], dtype=torch.long)
         change = self._split_taxels(touch[-1] - touch[lags])  # (lag, window, taxel, axis)
@@ -318,7 +326,7 @@ def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
     taxels = len(layout) // max(len(streams) * len(axes), 1)
     positions = [(channel.get("stream", ""), channel.get("taxel"), channel.get("axis", "")) for channel in layout]
     names = list(dict.fromkeys(taxel for _, taxel, _ in positions))
-    expected = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
+    expected = list(itertools.product(streams, names, axes))
     if None in names or positions != expected or taxels < 2:
         reason = f"these {len(layout)} channels are not" if layout else "the recordings contain latents"
         declared = (

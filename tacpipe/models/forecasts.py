@@ -167,6 +167,7 @@ class RecurrentForecast(nn.Module):
         return nn.functional.mse_loss(self._predict_scaled(windows), (ahead - self.touch_centre) / self.touch_half)
 
     def _predict_scaled(self, windows: ForecastWindows) -> Tensor:
+        """Return the predicted touch (horizon, window, feature) in the network's scale."""
         touch = (windows.touch - self.touch_centre) / self.touch_half
         pose = (windows.arm[..., :POSE] - self.pose_centre) / self.pose_half
         past = torch.cat([touch, pose[: windows.context]], -1)
@@ -210,8 +211,8 @@ def build(
 def resolve_loss(loss: AnyLoss, *, changes: bool) -> Loss:
     """Return ``loss``, or the default loss if it is ``auto``. ``changes``: features are already increments.
 
-    If a sensor repeats samples, most increments are 0, and so is their median, which is all that the absolute error
-    would teach.
+    If a sensor repeats samples, most increments are 0, and so is their median, which is all that a network would learn
+    from the absolute error.
 
     >>> resolve_loss("auto", changes=True), resolve_loss("auto", changes=False), resolve_loss("squared", changes=True)
     ('huber', 'absolute', 'squared')

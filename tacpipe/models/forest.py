@@ -41,18 +41,18 @@ class Forest:
 
         forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
         forest.fit(rows.astype(np.float32), values if values.shape[1] > 1 else values[:, 0])
-        grown = [tree.tree_ for tree in forest.estimators_]
-        starts = np.cumsum([0, *(tree.node_count for tree in grown)])[:-1]
+        trees_fitted = [tree.tree_ for tree in forest.estimators_]
+        starts = np.cumsum([0, *(tree.node_count for tree in trees_fitted)])[:-1]
         children = [
             np.where((pair := np.column_stack([tree.children_left, tree.children_right])) == LEAF, LEAF, pair + start)
-            for tree, start in zip(grown, starts, strict=True)
+            for tree, start in zip(trees_fitted, starts, strict=True)
         ]
         return cls(
             starts.astype(np.int32),
             np.concatenate(children).astype(np.int32),
-            np.concatenate([np.maximum(tree.feature, 0) for tree in grown]).astype(np.int32),
-            np.concatenate([tree.threshold for tree in grown]),
-            np.concatenate([tree.value[:, :, 0] for tree in grown]).astype(np.float32),
+            np.concatenate([np.maximum(tree.feature, 0) for tree in trees_fitted]).astype(np.int32),
+            np.concatenate([tree.threshold for tree in trees_fitted]),
+            np.concatenate([tree.value[:, :, 0] for tree in trees_fitted]).astype(np.float32),
         )
 
     @staticmethod
@@ -83,7 +83,7 @@ class Forest:
             if (child == LEAF).all():
                 break
             node = np.where(child == LEAF, node, child)
-        return np.stack([self.values[at].mean(axis=0, dtype=np.float64) for at in node])
+        return np.stack([self.values[leaves].mean(axis=0, dtype=np.float64) for leaves in node])
 
     def scaled(self, unit: Floats) -> Forest:
         """Return a forest whose predictions are multiplied by ``unit`` (value,), for example to convert their unit."""
@@ -103,10 +103,10 @@ class Forest:
         """
         nodes = len(self.values)
         numbers = np.arange(nodes)[:, None]
-        down = (self.children > numbers) & (self.children < nodes) | (self.children == LEAF)
+        is_valid_child = (self.children > numbers) & (self.children < nodes) | (self.children == LEAF)
         checks = {
             "roots": self.roots.ndim == 1 and len(self.roots) > 0,
-            "children": self.children.shape == (nodes, 2) and bool(down.all()),
+            "children": self.children.shape == (nodes, 2) and bool(is_valid_child.all()),
             "features": self.features.shape == (nodes,)
             and bool(((self.features >= 0) & (self.features < features)).all()),
             "cuts": self.cuts.shape == (nodes,),

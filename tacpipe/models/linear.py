@@ -133,26 +133,26 @@ class FittedBaselines:
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
         if their shapes are not those of the training windows.
         """
-        before, horizon = self.shared_weight.shape
+        past_changes, horizon = self.shared_weight.shape
         channels = len(self.mean_count)
-        steps = before + 1 + horizon
-        states = (len(self.ridge_actions.centre) - before * channels) // steps
-        if past.shape[1:] != (before + 1, channels) or motion.shape != (len(past), steps, states):
+        steps = past_changes + 1 + horizon
+        states = (len(self.ridge_actions.centre) - past_changes * channels) // steps
+        if past.shape[1:] != (past_changes + 1, channels) or motion.shape != (len(past), steps, states):
             raise TacpipeError(
                 f"Past frames of {past.shape} and motion of {motion.shape} do not fit the baselines; (window, "
-                f"{before + 1}, {channels}) and (window, {steps}, {states}) were fitted."
+                f"{past_changes + 1}, {channels}) and (window, {steps}, {states}) were fitted."
             )
-        past = past.astype(np.float32, copy=False)
-        last = past[:, -1:]  # (window, 1, channel)
-        shape = len(past), horizon, channels
+        frames = past.astype(np.float32, copy=False)
+        last = frames[:, -1:]  # (window, 1, channel)
+        shape = len(frames), horizon, channels
         yield "train_mean", np.broadcast_to(self.mean_count, shape).copy()
-        slope = (last - past[:, -1 - self.lag, None]) / np.float32(max(self.lag, 1))
+        slope = (last - frames[:, -1 - self.lag, None]) / np.float32(max(self.lag, 1))
         damping = _damping(np.array([self.phi]), horizon)[0].astype(np.float32)  # (step,)
         yield "damped_trend", last + damping[:, None] * slope
-        shared = np.matmul(self.shared_weight.T, past[:, :-1] - last) + self.shared_bias[:, None]
+        shared = np.matmul(self.shared_weight.T, frames[:, :-1] - last) + self.shared_bias[:, None]
         yield "last_value_linear", last + shared
         del shared
-        features = _features(past, motion.astype(np.float32, copy=False))
+        features = _features(frames, motion.astype(np.float32, copy=False))
         for name, ridge in (("ridge", self.ridge), ("ridge_actions", self.ridge_actions)):
             yield name, last + ridge(features[:, : len(ridge.centre)]).reshape(shape)
 
@@ -191,6 +191,10 @@ class _FeatureSums:
 
     @classmethod
     def accumulate(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
+        """Return the sums over ``part`` of features, relative to ``centre``, and increments, relative to ``bias``.
+
+        Raises `TacpipeError` if a value is not finite.
+        """
         past, motion, ahead = part
         xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
         for first in range(0, len(past), CHUNK):
@@ -223,7 +227,10 @@ class _SharedSums:
     def from_sums(
         cls, sums: _FeatureSums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]
     ) -> _SharedSums:
-        """Add up the diagonal blocks, those of each channel with itself; ``shape`` is context - 1, channels and horizon."""
+        """Return the sums over all windows and channels, from the blocks of each channel with itself.
+
+        ``shape`` is context - 1, channels and horizon.
+        """
         before, channels, horizon = shape
         changes = before * channels  # the changes are the first features
         x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
@@ -238,7 +245,7 @@ class _SharedSums:
         )
 
     def damped_trend(self) -> tuple[float, int]:
-        """Return phi and the lag in rows of the trend with the least squared error."""
+        """Return phi and the lag in rows of the trend with the least squared error; zeros for a context of one frame."""
         if not len(self.x):
             return 0.0, 0
         lags = np.arange(1, len(self.x) + 1)  # changes are ordered oldest first, and each is -lag times the slope
@@ -265,8 +272,8 @@ def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias:
     depend on alpha, neither for the weights nor for their error on other windows.
     """
     spread = np.sqrt(np.diagonal(sums.xx) / sums.windows)
-    moves = spread > np.finfo(np.float32).eps * np.abs(centre)  # rounding errors must not count as a feature
-    gain = np.where(moves, 1 / np.where(moves, spread, 1), 0)
+    varies = spread > np.finfo(np.float32).eps * np.abs(centre)  # rounding errors must not count as a feature
+    gain = np.where(varies, 1 / np.where(varies, spread, 1), 0)
     values, vectors = np.linalg.eigh(sums.xx * np.outer(gain, gain))
     basis = gain[:, None] * vectors  # maps standardised features to the basis that diagonalises their matrix
     xy = basis.T @ sums.xy
@@ -293,6 +300,7 @@ def _damping(phi: AnyFloats, horizon: int) -> AnyFloats:
 
 
 def _validate_windows(name: str, part: Windows) -> None:
+    """Raise `TacpipeError` if the windows ``name`` are empty or their shapes do not match."""
     past, motion, ahead = part
     if not len(past):
         raise TacpipeError(

@@ -86,18 +86,21 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
 
 
 def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
-    """Return the result of `lstm`, computed by torch's layer: cuDNN on a GPU, and the fastest on a CPU without gradients."""
+    """Return the result of `lstm`, computed by torch's layer.
+
+    It is cuDNN's on a GPU, and the fastest on a CPU without gradients.
+    """
     from_input, from_state, bias = weights
-    if lead is not None:
-        later = lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)
-        inputs = torch.cat([torch.cat([lead[0][None], later]), inputs], dim=-1)
+    all_inputs = inputs
+    if lead is not None:  # zero after the first step
+        lead_inputs = torch.cat([lead[0][None], lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)])
+        all_inputs = torch.cat([lead_inputs, inputs], dim=-1)
         from_input = torch.cat([lead[1], from_input], dim=1)
-    if state is None:
-        zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
-        state = zero, zero
+    zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
+    first_hidden, first_cell = (zero, zero) if state is None else state
     flat = [from_input, from_state, bias, torch.zeros_like(bias)]
     states, hidden, cell = torch.lstm(
-        inputs, (state[0][None], state[1][None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
+        all_inputs, (first_hidden[None], first_cell[None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
     )
     return states, (hidden[0], cell[0])
 
@@ -116,55 +119,64 @@ class _Layer(torch.autograd.Function):
         from_state: Tensor,
         bias: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return h of all steps (step, window, hidden), and the last h and c, each (window, hidden).
+
+        ``first`` is added to the products of the first step, (window, 4 hidden); ``hidden`` and ``cell`` are the
+        initial state, zero if None.
+        """
         (steps, windows, _), size = inputs.shape, from_state.shape[1]
-        used = size + inputs.shape[-1]
-        weights = from_state.new_empty(4 * size, used + 1)
-        weights[:, :size], weights[:, size:used], weights[:, used] = from_state, from_input, bias
+        width = size + inputs.shape[-1]
+        weights = from_state.new_empty(4 * size, width + 1)
+        weights[:, :size], weights[:, size:width], weights[:, width] = from_state, from_input, bias
         # tanh(a) = 2 sigmoid(2 a) - 1, and torch's sigmoid takes a quarter of the time
         weights[2 * size : 3 * size] *= 2
-        read = _pooled_empty(inputs, steps + 1, windows, used + 1)  # h', x and a 1 that multiplies b
-        read[0, :, :size] = 0.0 if hidden is None else hidden
-        read[:-1, :, size:used] = inputs
-        read[..., used] = 1.0
+        step_inputs_pool = _pooled_empty(inputs, steps + 1, windows, width + 1)  # h', x and a 1 that multiplies b
+        step_inputs_pool[0, :, :size] = 0.0 if hidden is None else hidden
+        step_inputs_pool[:-1, :, size:width] = inputs
+        step_inputs_pool[..., width] = 1.0
         gates = _pooled_empty(inputs, steps, windows, 4 * size)
         cells, tanhs = _pooled_empty(inputs, steps + 1, windows, size), _pooled_empty(inputs, steps, windows, size)
         cells[0] = 0.0 if cell is None else cell
         # Views of all steps are created at once: for small batches, a view costs as much as the arithmetic.
         columns = [part.unbind() for part in gates.chunk(4, dim=-1)]
-        every_read, every_h, every_c = read.unbind(), read[..., :size].unbind(), cells.unbind()
+        every_read, every_h, every_c = step_inputs_pool.unbind(), step_inputs_pool[..., :size].unbind(), cells.unbind()
         steps_of = zip(gates.unbind(), *columns, tanhs.unbind(), every_read, every_c, strict=False)
-        by_step, minus = weights.t(), inputs.new_tensor(-1.0)
-        for step, (row, i, f, g, o, tanh, step_inputs, before) in enumerate(steps_of):
-            torch.mm(step_inputs, by_step, out=row)
+        weights_by_input, minus_one = weights.t(), inputs.new_tensor(-1.0)
+        for step, (products, i, f, g, o, tanh, step_inputs, cell_before) in enumerate(steps_of):
+            torch.mm(step_inputs, weights_by_input, out=products)
             if first is not None and not step:
-                row += first
+                products += first
                 g += first[:, 2 * size : 3 * size]
-            row.sigmoid_()
-            torch.add(minus, g, alpha=2, out=g)
-            now = every_c[step + 1]
-            torch.mul(f, before, out=now)
-            now.addcmul_(i, g)
-            torch.add(now, now, out=tanh)
+            products.sigmoid_()
+            torch.add(minus_one, g, alpha=2, out=g)
+            cell_now = every_c[step + 1]
+            torch.mul(f, cell_before, out=cell_now)
+            cell_now.addcmul_(i, g)
+            torch.add(cell_now, cell_now, out=tanh)
             tanh.sigmoid_()
-            torch.add(minus, tanh, alpha=2, out=tanh)
+            torch.add(minus_one, tanh, alpha=2, out=tanh)
             torch.mul(o, tanh, out=every_h[step + 1])
         ctx.set_materialize_grads(False)  # otherwise an encoder's unused states would be returned as zeros
-        ctx.save_for_backward(from_input, from_state, read, gates, cells, tanhs)
-        return read[1:, :, :size], every_h[-1].clone(), every_c[-1].clone()
+        ctx.save_for_backward(from_input, from_state, step_inputs_pool, gates, cells, tanhs)
+        return step_inputs_pool[1:, :, :size], every_h[-1].clone(), every_c[-1].clone()
 
     @staticmethod
     @once_differentiable
     def backward(
         ctx: Any, by_states: Tensor | None, by_hidden: Tensor | None, by_cell: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        from_input, from_state, read, gates, cells, tanhs = ctx.saved_tensors
+        """Return the gradients of the arguments of `forward`, from those of its three results; None for those not needed.
+
+        Steps are processed in blocks from the last to the first, so that arrays of a block stay in the cache.
+        """
+        from_input, from_state, step_inputs, gates, cells, tanhs = ctx.saved_tensors
         steps, windows, size = tanhs.shape
         dh, dc = (tanhs.new_zeros(windows, size) for _ in range(2))
         for total, gradient in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
             if gradient is not None:
                 total += gradient
-        later = None if by_states is None else by_states.unbind()
-        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # gradient of all three weights, concatenated
+        by_earlier_states = None if by_states is None else by_states.unbind()
+        by_read = gates.new_zeros(gates.shape[-1], step_inputs.shape[-1])  # gradient of all three weights, concatenated
         needs = ctx.needs_input_grad
         by_inputs = _pooled_empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
         block = min(steps, max(1, CACHE_NUMBERS // (windows * gates.shape[-1])))
@@ -178,36 +190,39 @@ class _Layer(torch.autograd.Function):
             stop = min(start + block, steps)
             by_gates = every_gates[: stop - start]
             before = slice(start, stop)
-            after = read[start + 1 : stop + 1, :, :size]
+            after = step_inputs[start + 1 : stop + 1, :, :size]
             _write_factors(gates[before], after, cells[before], tanhs[before], by_gates, every_slopes[: stop - start])
             for step in reversed(range(start, stop)):
-                row, of_cell, of_output, slope = views[step - start]
+                by_step_gates, by_cell_gates, by_output_gate, slope = views[step - start]
                 dc.addcmul_(dh, slope)
-                of_cell.mul_(dc[:, None])
-                of_output.mul_(dh)
+                by_cell_gates.mul_(dc[:, None])
+                by_output_gate.mul_(dh)
                 dc.mul_(forgets[step])
-                if step and later is not None:
-                    torch.addmm(later[step - 1], row, from_state, out=dh)
+                if step and by_earlier_states is not None:
+                    torch.addmm(by_earlier_states[step - 1], by_step_gates, from_state, out=dh)
                 elif step:
-                    torch.mm(row, from_state, out=dh)
-            flat = by_gates.view(-1, gates.shape[-1])
-            by_read.addmm_(flat.t(), read[before].view(len(flat), -1))
+                    torch.mm(by_step_gates, from_state, out=dh)
+            flat_gates = by_gates.view(-1, gates.shape[-1])
+            by_read.addmm_(flat_gates.t(), step_inputs[before].view(len(flat_gates), -1))
             if by_inputs is not None:
-                torch.mm(flat, from_input, out=by_inputs[before].view(len(flat), -1))
-        first, used = every_gates[0], size + from_input.shape[1]
+                torch.mm(flat_gates, from_input, out=by_inputs[before].view(len(flat_gates), -1))
+        first, width = every_gates[0], size + from_input.shape[1]
         return (
             by_inputs,
             first.clone() if needs[1] else None,
             first @ from_state if needs[2] else None,
             dc if needs[3] else None,
-            by_read[:, size:used] if needs[4] else None,
+            by_read[:, size:width] if needs[4] else None,
             by_read[:, :size] if needs[5] else None,
-            by_read[:, used] if needs[6] else None,
+            by_read[:, width] if needs[6] else None,
         )
 
 
 def _step_views(by_gates: Tensor, slopes: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Return views of each step: da (window, 4 hidden), its i, f, g part (window, 3, hidden), its o part, and its slope."""
+    """Return views of each step of ``by_gates`` (step, window, 4 hidden) and ``slopes``.
+
+    These are da (window, 4 hidden), its i, f, g part (window, 3, hidden), its o part, and the slope.
+    """
     steps, windows, size = slopes.shape
     of_cell = by_gates.view(steps, windows, 4, size)[:, :, :3].unbind()
     of_output = by_gates[..., 3 * size :].unbind()
@@ -243,17 +258,18 @@ class _Loan(Bytes if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
 
 
 def _pooled_empty(like: Tensor, *shape: int) -> Tensor:
-    """Return an uninitialised tensor, in memory of earlier such tensors if possible.
+    """Return an uninitialised tensor of ``shape`` with the type of ``like``, in memory of earlier such tensors if possible.
 
     Tens of megabytes that are freed after every batch return to the operating system, and faulting their pages in again
-    takes a fifth of the time of the arithmetic. The tensor's storage owns the loan, so views keep it alive.
+    takes a fifth of the time of the arithmetic. The tensor's storage keeps the memory out of the pool, so views keep it
+    alive.
     """
-    needed = math.prod(shape) * like.element_size()
+    needed_bytes = math.prod(shape) * like.element_size()
     for _ in range(len(_free)):
         memory = _free.popleft()
-        if needed <= memory.nbytes <= 2 * needed:
+        if needed_bytes <= memory.nbytes <= 2 * needed_bytes:
             break
         _free.append(memory)
     else:
-        memory = np.empty(needed, np.uint8)
-    return torch.from_numpy(memory.view(_Loan))[:needed].view(like.dtype).view(shape)
+        memory = np.empty(needed_bytes, np.uint8)
+    return torch.from_numpy(memory.view(_Loan))[:needed_bytes].view(like.dtype).view(shape)

@@ -52,7 +52,7 @@ class Rocket:
         """Fit a transform on training slides ``x`` (slide, time, channel).
 
         ``features`` is rounded down to a multiple of 84. ``seed`` determines the channels of each kernel and the slides
-        of the biases. Raises `TacpipeError` if there are fewer than sums frames or 84 features, or a value is not
+        of the biases. Raises `TacpipeError` if there are fewer than `LENGTH` frames or 84 features, or a value is not
         finite.
         """
         _validate_slides(x)
@@ -63,15 +63,15 @@ class Rocket:
         dilations, counts_per_kernel = _dilations(frames, features // KERNELS)
         limit = min(channels, MAX_CHANNELS)
         channel_counts = (2 ** rng.uniform(0, np.log2(limit + 1), (len(dilations), KERNELS))).astype(int)
-        drawn = rng.random((len(dilations), KERNELS, channels)).argsort(axis=-1).argsort(axis=-1)
-        chosen = drawn < channel_counts[..., None]
+        ranks = rng.random((len(dilations), KERNELS, channels)).argsort(axis=-1).argsort(axis=-1)
+        chosen = ranks < channel_counts[..., None]
         examples = rng.integers(slides, size=(len(dilations), KERNELS))
         quantiles = np.arange(1, KERNELS * counts_per_kernel.sum() + 1) * GOLDEN % 1
         padded, outputs = _pad(x, dilations[-1]), []
-        for at, dilation in enumerate(dilations):
+        for index, dilation in enumerate(dilations):
             for kernel in range(KERNELS):
-                example = padded[:, :, examples[at, kernel], None]
-                outputs.append(_kernel_output(example, frames, at, kernel, dilation, chosen)[:, 0])
+                example = padded[:, :, examples[index, kernel], None]
+                outputs.append(_kernel_output(example, frames, index, kernel, dilation, chosen)[:, 0])
         quantiles_by_output = np.split(quantiles, np.repeat(counts_per_kernel, KERNELS).cumsum()[:-1])
         biases = [np.quantile(output, levels) for output, levels in zip(outputs, quantiles_by_output, strict=True)]
         return cls(frames, dilations, counts_per_kernel, chosen, np.concatenate(biases).astype(np.float32))
@@ -95,17 +95,17 @@ class Rocket:
 
     def _block(self, x: AnyFloats) -> AnyFloats:
         """Return the features of a block of slides, (feature, slide)."""
-        features, at = np.empty((len(self.biases), len(x)), np.float32), 0
+        features, row = np.empty((len(self.biases), len(x)), np.float32), 0
         padded = _pad(x, self.dilations[-1])
         for index, (dilation, features_per_kernel) in enumerate(zip(self.dilations, self.counts, strict=True)):
             for kernel in range(KERNELS):
                 output = _kernel_output(padded, self.frames, index, kernel, dilation, self.channels)
                 flags = np.empty(output.shape, np.bool_)
                 for _ in range(features_per_kernel):
-                    np.greater(output, self.biases[at], out=flags)
-                    features[at] = _count_true(flags)
-                    at += 1
-                features[at - features_per_kernel : at] /= len(output)
+                    np.greater(output, self.biases[row], out=flags)
+                    features[row] = _count_true(flags)
+                    row += 1
+                features[row - features_per_kernel : row] /= len(output)
         return features
 
     def to_tensors(self) -> dict[str, AnyArray]:
@@ -138,10 +138,11 @@ class Rocket:
 
 
 def _dilations(frames: int, features_per_kernel: int) -> tuple[Int32s, Int32s]:
-    """Return the dilations and how many of ``features_per_kernel`` each gets, both (dilation,).
+    """Return the dilations, and for each its number of features per kernel, both (dilation,).
 
-    They are spaced evenly over powers of two, up to the dilation at which a kernel spans the slide. Dilations that
-    round to the same integer are merged, and the remainder of rounding is distributed from the first on.
+    The numbers add up to ``features_per_kernel``. Dilations are spaced evenly over powers of two, up to that at which a
+    kernel spans the slide. Dilations that round to the same integer are merged, and the remainder of rounding is
+    distributed from the first on.
     """
     limit = min(features_per_kernel, MAX_DILATIONS)
     powers = np.linspace(0, np.log2((frames - 1) / (LENGTH - 1)), limit)
@@ -162,24 +163,28 @@ def _pad(x: AnyFloats, dilation: int) -> AnyFloats:
 def _kernel_output(
     padded: AnyFloats, frames: int, index: int, kernel: int, dilation: int, channels: Bools
 ) -> AnyFloats:
-    """Return the output of a kernel at each position, (time, slide)."""
+    """Return the output of a kernel on padded slides (channel, time, slide) at each position, (time, slide).
+
+    ``index`` is that of the dilation. The weights are 2 at `HEAVY_POSITIONS` and -1 elsewhere, computed as three times
+    the sum of the heavy positions minus the sum of all nine.
+    """
     reach = (LENGTH - 1) * int(dilation)
-    spare = padded.shape[1] - frames
-    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # every other kernel is padded
-    first = (spare - (rows - frames)) // 2
-    rows -= reach
-    chosen = np.flatnonzero(channels[index, kernel])
-    total = padded[chosen[0], first : first + rows + reach]
-    if len(chosen) > 1:
-        total = total + padded[chosen[1], first : first + rows + reach]
-        for channel in chosen[2:]:
-            total += padded[channel, first : first + rows + reach]
+    padding = padded.shape[1] - frames
+    length = frames + reach if (index + kernel) % 2 == 0 else frames  # every other kernel is padded
+    first = (padding - (length - frames)) // 2
+    length -= reach
+    summed_channels = np.flatnonzero(channels[index, kernel])
+    total = padded[summed_channels[0], first : first + length + reach]
+    if len(summed_channels) > 1:
+        total = total + padded[summed_channels[1], first : first + length + reach]
+        for channel in summed_channels[2:]:
+            total += padded[channel, first : first + length + reach]
     sums = total[:-dilation] + total[dilation:]
     sums = sums[: -2 * dilation] + sums[2 * dilation :]
     sums = sums[: -4 * dilation] + sums[4 * dilation :]  # sums of eight
-    sums = sums[:rows]
+    sums = sums[:length]
     sums += total[reach:]
-    heavy = [total[weight * dilation : weight * dilation + rows] for weight in HEAVY_POSITIONS[kernel]]
+    heavy = [total[weight * dilation : weight * dilation + length] for weight in HEAVY_POSITIONS[kernel]]
     output = heavy[0] + heavy[1]
     output += heavy[2]
     output *= 3
@@ -191,14 +196,15 @@ def _count_true(flags: Bools) -> AnyArray:
     """Count the True flags (time, slide) of each slide, (slide,)."""
     byte = flags.view(np.uint8)
     parts = [
-        np.add.reduce(byte[at : at + MAX_BYTE_COUNT], axis=0, dtype=np.uint8)
-        for at in range(0, len(byte), MAX_BYTE_COUNT)
+        np.add.reduce(byte[start : start + MAX_BYTE_COUNT], axis=0, dtype=np.uint8)
+        for start in range(0, len(byte), MAX_BYTE_COUNT)
     ]
     total: AnyFloats = np.sum(parts, axis=0, dtype=np.float32)
     return total
 
 
 def _validate_slides(x: AnyFloats) -> None:
+    """Raise `TacpipeError` unless slides are (slide, time, channel), long enough for a kernel, and finite."""
     if x.ndim != 3 or not x.size or x.shape[1] < LENGTH:
         raise TacpipeError(
             f"Slides of {x.shape} cannot be transformed; they must be (slide, time, channel), with {LENGTH} frames or "
@@ -284,7 +290,10 @@ class MinirocketClassifier:
 
 
 def _fit_readout(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Readout, float]:
-    """Fit a readout of patterns and strength, each (slide, feature), and return it with the weight of strength."""
+    """Fit a readout of patterns and strength, each (slide, feature), and return it with the weight of strength.
+
+    The weight has the smallest leave-one-out error of a ridge readout; the returned readout is a nearest-mean readout.
+    """
     features = np.concatenate([patterns, strength], axis=1)
 
     def feature_shares(share: float) -> AnyFloats:

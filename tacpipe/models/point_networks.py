@@ -9,6 +9,7 @@ channel instead of a product over all points. The results are those of `torch.nn
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -73,7 +74,10 @@ class LargestOverPoints(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """Return the maxima (cloud, output) for ``weight`` (output, input) and ``bias`` (output,)."""
+        """Return the maxima (cloud, output) over points (cloud, point, input) of a linear layer.
+
+        ``weight`` is (output, input) and ``bias`` (output,).
+        """
         largest, indices = (_largest_product_cached if points.device.type == "cpu" else _largest_product)(
             points, weight
         )
@@ -110,14 +114,14 @@ def _largest_product(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _largest_product_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the result of `_largest_product`, computed per cloud so that products fit the cache, with numpy's argmax."""
+    """Return the result of `_largest_product` on a CPU: per cloud, so that products fit the cache, with numpy's argmax."""
     products = points.new_empty(len(weight), points.shape[1])  # (output, point)
     largest = points.new_empty(len(points), len(weight))
     indices = torch.empty(largest.shape, dtype=torch.long)
-    for cloud, at in enumerate(indices):
+    for cloud, cloud_indices in enumerate(indices):
         torch.mm(weight, points[cloud].T, out=products)
-        at.copy_(torch.from_numpy(products.numpy().argmax(axis=1)))
-        torch.gather(products, 1, at[:, None], out=largest[cloud][:, None])
+        cloud_indices.copy_(torch.from_numpy(products.numpy().argmax(axis=1)))
+        torch.gather(products, 1, cloud_indices[:, None], out=largest[cloud][:, None])
     return largest, indices
 
 
@@ -175,7 +179,7 @@ class PatchNetwork(nn.Module):
         )
 
     def forward(self, patches: Tensor, numbers: Tensor) -> Tensor:
-        """Return the values of touch (cloud, value) from patches (cloud, patch, point, channel) and numbers (cloud, number).
+        """Return the predicted touch (cloud, value) from patches (cloud, patch, point, channel) and numbers (cloud, number).
 
         The patches are those around g1, around g2, and the whole cloud.
         """
@@ -214,10 +218,10 @@ class EdgeBackbone(nn.Module):
         clouds, count, channels = points.shape
         distances = torch.cdist(points[:, :, :3], points[:, :, :3])
         nearest = distances.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
-        rows = torch.arange(clouds, device=points.device)[:, None, None]
-        around = points[rows, nearest] - points[:, :, None]  # (cloud, point, neighbour, channel)
+        cloud_index = torch.arange(clouds, device=points.device)[:, None, None]
+        offsets = points[cloud_index, nearest] - points[:, :, None]  # (cloud, point, neighbour, channel)
         centre = points[:, :, None].expand(clouds, count, nearest.shape[2], channels)
-        return _pool(self.layers(self.edges(torch.cat([centre, around], dim=3)).amax(dim=2)))
+        return _pool(self.layers(self.edges(torch.cat([centre, offsets], dim=3)).amax(dim=2)))
 
 
 def _pool(values: Tensor) -> Tensor:
@@ -251,10 +255,9 @@ class PointNet(nn.Module):
         self.head = _fully_connected(FEATURES + grasp, head, outputs)
 
     def forward(self, points: Tensor, grasp: Tensor) -> Tensor:
-        """Return the values of touch (cloud, value)."""
-        if self.transform is not None:
-            points = points @ self.transform(points)
-        values: Tensor = self.head(torch.cat([self.points(points), grasp], dim=1))
+        """Return the predicted touch (cloud, value) from points (cloud, point, channel) and grasp (cloud, number)."""
+        turned = points if self.transform is None else points @ self.transform(points)
+        values: Tensor = self.head(torch.cat([self.points(turned), grasp], dim=1))
         return values
 
 
@@ -295,7 +298,6 @@ class PointTransform(nn.Module):
 def _fully_connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     """Return fully connected layers with batch normalisation and ReLU, and a linear output layer."""
     layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.BatchNorm1d(width), nn.ReLU()]
-        inputs = width
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+    for before, after in itertools.pairwise((inputs, *hidden)):
+        layers += [nn.Linear(before, after), nn.BatchNorm1d(after), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear((inputs, *hidden)[-1], outputs))

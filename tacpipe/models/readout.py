@@ -58,10 +58,10 @@ class Readout:
         values, vectors = np.linalg.eigh((standardised @ standardised.T).astype(np.float64))
         values = np.maximum(values, 0)
         bias = targets.mean(axis=0)
-        turned = vectors.T @ (targets - bias)
+        rotated_targets = vectors.T @ (targets - bias)
         best = None
         for alpha in ALPHAS:
-            dual = vectors @ (turned / (values + alpha)[:, None])  # (slide, class)
+            dual = vectors @ (rotated_targets / (values + alpha)[:, None])  # (slide, class)
             leverage = np.square(vectors) @ (values / (values + alpha)) + 1 / len(labels)
             error = float(np.square(alpha * dual / np.maximum(1 - leverage, MIN_SPREAD)[:, None]).mean())
             if best is None or error < best[0]:
@@ -129,7 +129,10 @@ class Readout:
 
 
 def _centre_and_gain(features: AnyFloats, shares: AnyFloats | None) -> tuple[AnyFloats, AnyFloats]:
-    """Return centre and gain (feature,) that scale slides to a mean square of 1, divided among features by ``shares``."""
+    """Return centre and gain, both (feature,), that scale slides to a mean square of 1.
+
+    The gain is divided among features in proportion to ``shares``, equally if it is None.
+    """
     centre, spread = features.mean(axis=0, dtype=np.float64), features.std(axis=0, dtype=np.float64)
     gain = np.where(spread > MIN_SPREAD, 1 / np.maximum(spread, MIN_SPREAD), 0)
     if shares is not None:
@@ -139,6 +142,7 @@ def _centre_and_gain(features: AnyFloats, shares: AnyFloats | None) -> tuple[Any
 
 
 def _check(features: AnyFloats, labels: Ints, classes: int) -> None:
+    """Raise `TacpipeError` if shapes do not match, there are fewer than two classes, or a feature is not finite."""
     if features.ndim != 2 or labels.shape != features.shape[:1]:
         raise TacpipeError(
             f"Features of {features.shape} and labels of {labels.shape} do not match; they must be "
@@ -192,20 +196,20 @@ class Level:
             raise TacpipeError("Some slides contain values that are not finite. Segment them again, or exclude these.")
         centre, spread = levels.mean(axis=0), levels.std(axis=0)
         gain = np.divide(1, spread, out=np.zeros_like(spread), where=spread > 1e-9 * (1 + np.abs(centre)))
-        moves = gain > 0
-        if not moves.any():
+        is_used = gain > 0
+        if not is_used.any():
             raise TacpipeError("All slides have the same mean levels, so they do not distinguish classes.")
         analysis = LinearDiscriminantAnalysis(
             solver="lsqr", shrinkage="auto", priors=np.full(len(classes), 1 / len(classes))
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a class of one slide adds nothing to the covariance
-            analysis.fit((levels - centre)[:, moves] * gain[moves], labels)
+            analysis.fit((levels - centre)[:, is_used] * gain[is_used], labels)
         # for two classes, scikit-learn fits only their difference
         signs = np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None
         weight = np.zeros((x.shape[2], len(classes)))
         coefficients = analysis.coef_ if signs is None else signs[:, None] * analysis.coef_
-        weight[moves] = gain[moves, None] * coefficients.T
+        weight[is_used] = gain[is_used, None] * coefficients.T
         bias = analysis.intercept_ if signs is None else signs * analysis.intercept_
         parts = (part.astype(np.float32) for part in (centre, weight, bias))
         return cls(classes.astype(np.int32), *parts)
@@ -315,7 +319,7 @@ def view_features(x: AnyFloats, view: View = "all") -> Float32s:
     """
     if view == "level_removed":
         _check_slides(x)
-        x = x - x.mean(axis=1, keepdims=True, dtype=np.float64)
+        return statistics(x - x.mean(axis=1, keepdims=True, dtype=np.float64))
     features = statistics(x)
     return features[:, : x.shape[2] + len(ACROSS_CHANNELS) + 2] if view == "level" else features
 
@@ -336,6 +340,7 @@ def statistics(x: AnyFloats) -> Float32s:
 
 
 def _check_slides(x: AnyFloats) -> None:
+    """Raise `TacpipeError` unless slides are (slide, time, channel), long enough for statistics, and finite."""
     if x.ndim != 3 or x.shape[1] < MIN_FRAMES or not x.shape[2]:
         raise TacpipeError(
             f"Slides of {x.shape} have no statistics; they must be (slide, time, channel) with at least {MIN_FRAMES} frames "
@@ -346,6 +351,7 @@ def _check_slides(x: AnyFloats) -> None:
 
 
 def _statistics(x: AnyFloats) -> Float32s:
+    """Return `statistics` of a chunk of slides, without checks."""
     root = _append_profile(np.sign(x) * np.sqrt(np.abs(x)).astype(np.float64))  # a tared sensor may be below zero
     steps = np.diff(root, axis=1)
     step = np.abs(steps).mean(axis=1)

@@ -78,6 +78,7 @@ class Convolution(nn.Module):
     """
 
     def __init__(self, channels: int, unpool: str = "nearest") -> None:
+        """Create the layers. Raises `TacpipeError` if the channels do not form the grid, or for an unknown ``unpool``."""
         super().__init__()
         if channels != GRID[0] * GRID[1]:
             raise TacpipeError(
@@ -214,6 +215,7 @@ class RecurrentAutoencoder(nn.Module):
         return scores
 
     def _decode(self, latents: Tensor, steps: int) -> Tensor:
+        """Return the reconstructed slides (time, slide, channel) of ``latents`` (slide, latent)."""
         initial = self.from_latents(latents)  # (slide, hidden)
         if self.shape.decoder == "D1":
             zeros = initial.new_zeros(steps, len(initial), 1)

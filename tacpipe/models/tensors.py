@@ -32,7 +32,10 @@ def require_network(built: object, architecture: str) -> nn.Module:
 
 
 def require_output(output: object, shape: tuple[int, ...], architecture: str, rows: str, axes: str) -> None:
-    """Raise `TacpipeError` unless a network's output for these ``rows`` is a tensor of ``shape``, called ``axes``."""
+    """Raise `TacpipeError` unless ``output``, a network's output for ``rows``, is a tensor of ``shape``.
+
+    ``axes`` names the axes in the message.
+    """
     if not isinstance(output, torch.Tensor) or tuple(output.shape) != shape:
         returned = str(tuple(output.shape)) if isinstance(output, torch.Tensor) else type(output).__name__
         raise TacpipeError(

@@ -66,7 +66,7 @@ class Transfer:
 
     @classmethod
     def fit(cls, slides: Labelled, other_sensors: Sequence[Labelled] = ()) -> Transfer:
-        """Return the classes of a sensor, fitted on its labelled ``slides`` and on those of ``other_sensors``.
+        """Fit the classes of a sensor on its labelled ``slides`` and on those of ``other_sensors``.
 
         Raises `TacpipeError` if arrays do not fit one another, values are not finite, no class has two slides, the
         sensor has fewer than two classes, or fewer than `MIN_SHARED` of those of another sensor.
@@ -75,21 +75,25 @@ class Transfer:
             _validate_slides(part, slides.features.shape[-1])
         classes = np.unique(np.concatenate([part.labels for part in (slides, *other_sensors)]))
         means = _means(slides, classes)
-        inner = _covariance_within(slides)
+        covariance_within = _covariance_within(slides)
         labelled = np.isfinite(means[:, 0])
         expected, variance = _predict_means(means, [_means(sensor, classes) for sensor in other_sensors])
         has_other = np.isfinite(expected[:, 0])
         prior = np.where(has_other[:, None], expected, means[labelled].mean(axis=0))
-        spread = np.where(has_other[:, None], variance, means[labelled].var(axis=0, ddof=1) + _smallest_variance(inner))
-        mean, covariance = prior.copy(), inner + np.stack([np.diag(variances) for variances in spread])
+        spread = np.where(
+            has_other[:, None], variance, means[labelled].var(axis=0, ddof=1) + _smallest_variance(covariance_within)
+        )
+        mean, covariance = prior.copy(), covariance_within + np.stack([np.diag(variances) for variances in spread])
         from_others = Gaussians(
             np.where(has_other[:, None], prior, 0), np.where(has_other[:, None, None], covariance, 0)
         )
         for index in np.flatnonzero(labelled):
-            wide = np.diag(spread[index])
-            trust = wide @ np.linalg.inv(wide + inner / (slides.labels == classes[index]).sum())
+            prior_covariance = np.diag(spread[index])
+            trust = prior_covariance @ np.linalg.inv(
+                prior_covariance + covariance_within / (slides.labels == classes[index]).sum()
+            )
             mean[index] += trust @ (means[index] - prior[index])
-            covariance[index] = inner + wide - trust @ wide
+            covariance[index] = covariance_within + prior_covariance - trust @ prior_covariance
         return cls(classes.astype(np.int32), Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2), from_others)
 
     def to_tensors(self) -> dict[str, AnyArray]:
@@ -115,6 +119,7 @@ def _predict_means(means: AnyFloats, other_means: Sequence[AnyFloats]) -> tuple[
     """Predict the class means of a sensor from other sensors' class means, and return them with their variance.
 
     All are (class, feature), with NaN in the rows of classes that the sensor, or all other sensors, did not learn.
+    Raises `TacpipeError` if another sensor shares fewer than `MIN_SHARED` classes.
     """
     weight, total = np.zeros(means.shape), np.zeros(means.shape)
     for source_means in other_means:
@@ -129,16 +134,19 @@ def _predict_means(means: AnyFloats, other_means: Sequence[AnyFloats]) -> tuple[
             target[i] - _map_features(np.delete(source, i, 0), np.delete(target, i, 0), source[i])
             for i in range(int(shared.sum()))
         ]
-        precise = 1 / (np.square(errors).mean(axis=0) + 1e-9)
+        precision = 1 / (np.square(errors).mean(axis=0) + 1e-9)
         has_class = np.isfinite(source_means[:, 0])
-        weight[has_class] += precise
-        total[has_class] += precise * _map_features(source, target, source_means[has_class])
+        weight[has_class] += precision
+        total[has_class] += precision * _map_features(source, target, source_means[has_class])
     with np.errstate(invalid="ignore", divide="ignore"):
         return total / weight, np.where(weight > 0, 1 / weight, np.nan)
 
 
 def _map_features(source: AnyFloats, target: AnyFloats, features: AnyFloats) -> AnyFloats:
-    """Map features of one sensor to another, fitted on the means (class, feature) of the classes that both learned."""
+    """Map ``features`` (…, feature) of one sensor to another.
+
+    The map is fitted on the means (class, feature) of the classes that both learned.
+    """
     centre, target_centre = source.mean(axis=0), target.mean(axis=0)
     squares = np.square(source - centre).sum(axis=0)
     products = ((source - centre) * (target - target_centre)).sum(axis=0)
@@ -248,10 +256,8 @@ class Bands:
         [40.0, 300.0]
         """
         distance_m = min(sampling.distance_m for sampling in sensors)
-        lowest, highest = (
-            MIN_PERIODS / distance_m,
-            MAX_FREQUENCY_FRACTION * min(sampling.max_per_m for sampling in sensors),
-        )
+        lowest = MIN_PERIODS / distance_m
+        highest = MAX_FREQUENCY_FRACTION * min(sampling.max_per_m for sampling in sensors)
         if not lowest < highest:
             raise TacpipeError(
                 f"The shortest slide is {distance_m:.3g} m long and resolves more than {lowest:.3g} periods per metre, "
@@ -283,11 +289,13 @@ class Bands:
         return features
 
     def _chunk_features(self, slides: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
-        """Return the features of a chunk of slides."""
+        """Return the features (slide, band + 1) of a chunk of slides (slide, time, channel)."""
         level = np.maximum(slides.mean(axis=1, dtype=np.float64), 0)  # (slide, channel)
-        leading = np.argsort(-level, axis=1, kind="stable")[:, : max(1, round(LEADING_FRACTION * level.shape[1]))]
-        chosen = np.take_along_axis(slides, leading[:, None], axis=2).astype(np.float32)
-        level = np.take_along_axis(level, leading, axis=1)
+        leading_channels = np.argsort(-level, axis=1, kind="stable")[
+            :, : max(1, round(LEADING_FRACTION * level.shape[1]))
+        ]
+        chosen = np.take_along_axis(slides, leading_channels[:, None], axis=2).astype(np.float32)
+        level = np.take_along_axis(level, leading_channels, axis=1)
         spectra = [self._power(part, waves) for part in _windows(chosen, len(waves))]
         power = np.log(np.mean(spectra, axis=0) + ROUNDING_POWER)  # (slide, channel, band)
         mean = power.mean(axis=2)

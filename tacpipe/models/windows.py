@@ -82,10 +82,10 @@ def motion(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
     """
     position, quaternions = windows.arm[..., :3], windows.arm[..., 3:POSE]
     now = windows.context - 1
-    turned = rotations(quaternions)  # (row, window, 3, 3)
-    inward = turned[now].transpose(-1, -2)  # (window, 3, 3), from the base frame to the hand frame
-    displacement = _apply(inward, position - position[now])
-    relative = inward @ turned
+    hand_rotations = rotations(quaternions)  # (row, window, 3, 3)
+    to_hand = hand_rotations[now].transpose(-1, -2)  # (window, 3, 3), from the base frame to the hand frame
+    displacement = _apply(to_hand, position - position[now])
+    relative = to_hand @ hand_rotations
     vector = 0.5 * torch.stack(
         [
             relative[..., 2, 1] - relative[..., 1, 2],
@@ -94,8 +94,8 @@ def motion(windows: ForecastWindows) -> tuple[Tensor, Tensor]:
         ],
         -1,
     )
-    linear, angular = _apply(inward, windows.arm[..., POSE : POSE + 3]), _apply(inward, windows.arm[..., POSE + 3 :])
-    return torch.cat([displacement, vector, linear, angular], -1), inward[..., 2]
+    linear, angular = _apply(to_hand, windows.arm[..., POSE : POSE + 3]), _apply(to_hand, windows.arm[..., POSE + 3 :])
+    return torch.cat([displacement, vector, linear, angular], -1), to_hand[..., 2]
 
 
 def without_plan(windows: ForecastWindows) -> ForecastWindows:
@@ -105,7 +105,7 @@ def without_plan(windows: ForecastWindows) -> ForecastWindows:
 
 
 def swap_plans(windows: ForecastWindows, sources: Tensor) -> ForecastWindows:
-    """Replace plans by those of the windows ``sources`` (window,), moved to start at the present pose.
+    """Return windows whose plans are those of the windows ``sources`` (window,), moved to start at the present pose.
 
     The plans are plausible but wrong. Positions, orientations and velocities are transformed by one rigid motion.
     """

@@ -45,7 +45,10 @@ def task(kind: Any) -> str | None:
 
 @functools.cache
 def kinds(base: Kind) -> tuple[Kind, ...]:
-    """Return the classes of the architectures that extend ``base``: default, own, plug-ins."""
+    """Return the classes of the architectures that extend ``base``, the default one first.
+
+    Leaves out architectures that cannot be loaded or that share a choice with an earlier one.
+    """
     architectures: list[Kind] = []
     for name in registry.architectures(str(task(base))):
         with contextlib.suppress(TacpipeError):  # an architecture that cannot be loaded does not affect the others
@@ -61,16 +64,16 @@ def load(base: Kind, name: str) -> Kind:
     task_name = task(base)
     architecture = registry.load_architecture(str(task_name), name)
     target = registry.entry_points()[registry.MODELS][f"{task_name}.{name}"]
-    misfits = {
+    requirements = {
         f"a dataclass that extends {base.__module__}.{base.__name__}": isinstance(architecture, type)
         and issubclass(architecture, base)
         and dataclasses.is_dataclass(architecture),
     }
-    if all(misfits.values()):
-        misfits[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(architecture, TAG)
+    if all(requirements.values()):
+        requirements[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(architecture, TAG)
         missing = sorted(getattr(architecture, "__abstractmethods__", ()))
-        misfits[f"a class with the methods {', '.join(missing)}"] = not missing
-    for requirement, fits in misfits.items():
+        requirements[f"a class with the methods {', '.join(missing)}"] = not missing
+    for requirement, fits in requirements.items():
         if not fits:
             raise TacpipeError(
                 f"{target}, registered as the architecture {name} of {task_name}, must be {requirement}."
@@ -85,7 +88,10 @@ def find(base: Any, architecture: str) -> Kind | None:
 
 
 def require(base: Any, value: Any) -> None:
-    """Raise an error with the reason if the installed architecture ``value`` is not available."""
+    """Raise `TacpipeError` if ``value`` is an installed architecture that is hidden by another with the same choice.
+
+    Does nothing for other values.
+    """
     task_name = task(base)
     if task_name is None or not isinstance(value, str) or value not in registry.architectures(task_name):
         return

@@ -72,7 +72,7 @@ class CommaList:
         >>> CommaList(int).items("1, 5,10")
         [1, 5, 10]
         """
-        return [fields.parsed(part.strip(), self.item_type) for part in text.split(",") if part.strip()]
+        return [fields.parse_text(part.strip(), self.item_type) for part in text.split(",") if part.strip()]
 
     def allows(self, value: str) -> bool:
         """Return whether there are enough items and each is valid."""
@@ -100,7 +100,7 @@ class Assignments:
         {'biotac': 0.025, 'roboskin': 0.05}
         """
         pairs = [part.partition("=") for part in text.split(self.between) if part.strip()]
-        return {name.strip(): fields.parsed(value.strip(), self.item_type) for name, _, value in pairs}
+        return {name.strip(): fields.parse_text(value.strip(), self.item_type) for name, _, value in pairs}
 
     def allows(self, value: str) -> bool:
         """Return whether all names are present and different, and each value is valid."""

@@ -88,7 +88,7 @@ def extra_for(module: str) -> str | None:
     """Return the extra that includes a module, or None if there is none or tacpipe is not installed."""
     package = _normal(PACKAGES.get(module, module))
     distribution = _distribution()
-    optional = _optional(distribution.requires or []) if distribution is not None else {}
+    optional = _packages_by_extra(distribution.requires or []) if distribution is not None else {}
     return next((extra for extra, packages in optional.items() if extra != TOGETHER and package in packages), None)
 
 
@@ -142,27 +142,27 @@ def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:
     if "vcs_info" in source:
         version = source["vcs_info"]
         return [shlex.quote(f"{NAME}[{extra}] @ {version['vcs']}+{url}@{version['commit_id']}")]
-    place = _path(url)
-    if place is None:
+    path = _path(url)
+    if path is None:
         return [shlex.quote(f"{NAME}[{extra}] @ {url}")]
     from pathlib import Path
 
-    is_working_folder = Path.cwd() == Path(place)
-    requirement = shlex.quote(f"{'.' if is_working_folder else place}[{extra}]")
+    is_working_folder = Path.cwd() == Path(path)
+    requirement = shlex.quote(f"{'.' if is_working_folder else path}[{extra}]")
     return ["-e", requirement] if source.get("dir_info", {}).get("editable") else [requirement]
 
 
 def _source(distribution: Distribution) -> DirectUrl | None:
-    """Return the direct URL that a distribution was installed from (PEP 610), or None if it is gone."""
+    """Return the direct URL that a distribution was installed from (PEP 610), or None if it is unknown or gone."""
     import json
     from pathlib import Path
 
     try:
         value: DirectUrl = json.loads(distribution.read_text("direct_url.json") or "null")
-        place = _path(str(value["url"]))
+        path = _path(str(value["url"]))
     except (ValueError, TypeError, KeyError):
         return None
-    return value if place is None or Path(place).exists() else None
+    return value if path is None or Path(path).exists() else None
 
 
 def _from_index(distribution: Distribution) -> bool:
@@ -188,7 +188,7 @@ def _pip() -> str:
 
 
 def _distribution() -> Distribution | None:
-    """Return the installed distribution of tacpipe, preferably one with a direct URL."""
+    """Return the installed distribution of tacpipe, preferably one with a direct URL, or None if there is none."""
     from importlib.metadata import distributions
 
     installed = list(distributions(name=NAME))
@@ -198,12 +198,11 @@ def _distribution() -> Distribution | None:
     )
 
 
-def _optional(requires: list[str]) -> dict[str, set[str]]:
+def _packages_by_extra(requires: list[str]) -> dict[str, set[str]]:
     """Return the packages of each extra, in the order of the metadata.
 
-    >>> _optional(["numpy>=1.26", 'torch>=2.4; extra == "learn"', 'scikit-learn>=1; extra == "learn"'])["learn"] == {
-    ...     "torch", "scikit-learn"}
-    True
+    >>> _packages_by_extra(["numpy>=1.26", 'torch>=2.4; extra == "learn"', 'polars>=1; extra == "tables"'])
+    {'learn': {'torch'}, 'tables': {'polars'}}
     """
     packages: dict[str, set[str]] = {}
     for text in requires:
@@ -236,7 +235,7 @@ _NAME = "tacpipe_failure"  # attribute of the exception, which is pickled with i
 
 
 def attach_stage(error: BaseException, stage: str, recording: str, outer: tuple[str, ...]) -> None:
-    """Add to ``error`` its stage, and its traceback without the first frames, which are in the files ``outer``."""
+    """Add its stage and recording to ``error``, and its traceback without the leading frames from the files ``outer``."""
     described = traceback.TracebackException.from_exception(error)
     frames = list(described.stack)
     while frames and frames[0].filename in outer:
@@ -250,9 +249,9 @@ def failure_text(error: BaseException) -> str | None:
     failure: StageFailure | None = getattr(error, _NAME, None)
     if failure is None or os.environ.get(ALL_FRAMES):
         return None
-    place = f" on recording {failure['recording']}" if failure["recording"] else ""
+    on_recording = f" on recording {failure['recording']}" if failure["recording"] else ""
     return (
-        f"The code of stage {failure['stage']} raised {type(error).__name__}{place}:\n{failure['frames'].rstrip()}\n"
+        f"The code of stage {failure['stage']} raised {type(error).__name__}{on_recording}:\n{failure['frames'].rstrip()}\n"
         f"What was finished is kept in the store. Set {ALL_FRAMES}=1 to see the frames of tacpipe too."
     )
 

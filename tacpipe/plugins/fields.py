@@ -47,7 +47,7 @@ def hints(kind: type[Any]) -> Mapping[str, Annotation]:
 
 
 def bare(annotation: Any) -> Any:
-    """Return an annotation without constraints, and without None if that is the only alternative.
+    """Return an annotation without constraints; also without None if only one other type remains.
 
     >>> bare(Annotated[int, "of 1 or more"]), bare(float | None)
     (<class 'int'>, <class 'float'>)
@@ -112,7 +112,7 @@ def fits(value: Any, annotation: Any) -> bool:
     return _fit(value, annotation, "") is not REFUSED
 
 
-def filled(kind: type[Any], values: Values, place: str, noun: str = "param") -> Any:
+def build_dataclass(kind: type[Any], values: Values, place: str, noun: str = "param") -> Any:
     """Return the dataclass ``kind`` with ``values`` in place of defaults; an int becomes a float if a float is expected.
 
     Raises `UsageError` for unknown names, invalid values, and missing values without a default.
@@ -140,10 +140,10 @@ def unknown(key: Any, names: Collection[str], place: str, noun: str) -> UsageErr
     return UsageError(f"{place}: there is no {noun} {shown_key}; there are {valid}.{suggestion(str(key), names)}")
 
 
-def parsed(text: str, annotation: Any) -> Any:
+def parse_text(text: str, annotation: Any) -> Any:
     """Return the value that ``text`` represents for an annotation, or the text itself if it represents none.
 
-    >>> parsed("3", int), parsed("3", float), parsed("3", str), parsed("x", int), parsed("3", Literal[1, 3])
+    >>> parsed("3", int), parsed("3", float), parsed("3", str), parsed("x", int), parse_text("3", Literal[1, 3])
     (3, 3.0, '3', 'x', 3)
     """
     kind = bare(annotation)
@@ -183,7 +183,7 @@ def describe(annotation: Any) -> str:
 def _fit(value: Any, annotation: Any, place: str) -> Any:
     """Return ``value`` converted to the type of ``annotation``, or `REFUSED` if it is invalid.
 
-    A mapping fills a dataclass, with the errors of `filled`.
+    A mapping fills a dataclass, with the errors of `build_dataclass`.
     """
     origin = get_origin(annotation)
     if origin is Annotated:
@@ -207,7 +207,7 @@ def _fit(value: Any, annotation: Any, place: str) -> Any:
         return REFUSED if any(fit is REFUSED for fit in fitted) else tuple(fitted)
     if dataclasses.is_dataclass(annotation):
         if isinstance(value, Mapping):
-            return filled(typing.cast(type, annotation), value, place, "key")
+            return build_dataclass(typing.cast(type, annotation), value, place, "key")
         return value if isinstance(value, typing.cast(type, annotation)) else REFUSED
     return _fit_plain(value, annotation)
 

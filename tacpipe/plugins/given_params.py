@@ -46,19 +46,20 @@ def build(
 ) -> Any:
     """Return the params of stage ``name``.
 
-    Defaults are overridden by the file, the preset, ``--set`` and options, in this order.
-    Raises `UsageError` for unknown names, invalid values, options of another kind of params than the chosen one, and
-    invalid combinations.
+    Defaults are overridden by the file, the preset, ``--set`` and options, in this order. Raises `UsageError` for
+    unknown names, invalid values, params of another kind than the chosen one, and invalid combinations.
     """
-    early = [] if file is None else _from_file(file, block or name, required=block is not None)
-    late = [_from_set(name, text) for text in sets]
-    late += [_Setting(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
-    kind = _choose_kind(stage, early, late, preset)
-    between = [] if preset is None else _from_preset(name, stage, kind, preset)
+    file_settings = [] if file is None else _from_file(file, block or name, required=block is not None)
+    option_settings = [_from_set(name, text) for text in sets]
+    option_settings += [
+        _Setting(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()
+    ]
+    kind = _choose_kind(stage, file_settings, option_settings, preset)
+    preset_settings = [] if preset is None else _from_preset(name, stage, kind, preset)
     values: dict[str, Any] = {}
-    chooses = params_of.tag(stage)
-    for setting in (*early, *between, *late):
-        if setting.key != chooses or setting.value in params_of.choices(
+    tag_name = params_of.tag(stage)
+    for setting in (*file_settings, *preset_settings, *option_settings):
+        if setting.key != tag_name or setting.value in params_of.choices(
             kind, setting.key
         ):  # other values were overridden
             values[setting.key] = _convert_setting(stage, kind, setting, values)
@@ -100,7 +101,11 @@ def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
 
 
 def _convert_setting(stage: AnyStage, kind: Kind, setting: _Setting, before: Values) -> Any:
-    """Return the value of ``setting`` converted to the type of its field in ``kind``."""
+    """Return the value of ``setting`` converted to the type of its field in ``kind``.
+
+    ``before`` contains the values converted so far. Raises `UsageError` for a name or value that this kind does not
+    accept.
+    """
     annotations, name = fields_of.hints(kind), params_of.tag(stage)
     if setting.key not in params_of.fields(stage):
         raise fields_of.unknown(setting.key, params_of.fields(stage), setting.origin, "param")
@@ -116,7 +121,7 @@ def _convert_setting(stage: AnyStage, kind: Kind, setting: _Setting, before: Val
         value = fields_of.check(setting.value, annotation, setting.name, setting.place)
         files = [mark for mark in fields_of.metadata(annotation) if isinstance(mark, TomlFile)]
         return files[0].read(value) if files else value
-    owners = params_of.having(stage, setting.key)
+    owners = params_of.choices_with(stage, setting.key)
     raise UsageError(
         f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
         f"Leave it out, or set {name} to {_or(owners)}."
@@ -128,6 +133,10 @@ def _or(names: Sequence[str]) -> str:
 
 
 def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Setting]:
+    """Return the settings of a preset.
+
+    Raises `UsageError` if the stage has no such preset, or only for another kind of params.
+    """
     presets = params_of.presets_of(kind)
     if preset not in params_of.presets(stage):
         have = f"it has {', '.join(params_of.presets(stage))}" if params_of.presets(stage) else "it has none"
@@ -153,10 +162,15 @@ def _parse(text: str) -> Any:
 
 def _from_file(path: Path, block: str, *, required: bool) -> list[_Setting]:
     place = f"{path}, block {block}"
-    return [_Setting(place, key, value) for key, value in _block(path, block, required=required).items()]
+    return [_Setting(place, key, value) for key, value in _read_block(path, block, required=required).items()]
 
 
-def _block(path: Path, block: str, *, required: bool) -> Values:
+def _read_block(path: Path, block: str, *, required: bool) -> Values:
+    """Return a mapping in a YAML file, given by its keys joined by dots.
+
+    If it does not exist, returns an empty mapping, or raises `UsageError` if it is ``required``. Raises `UsageError` if
+    the file cannot be read, and for a value that is not a mapping.
+    """
     try:
         content = config_text.load_yaml(regular.content(path)) or {}
     except FileNotFoundError:

@@ -23,8 +23,8 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import architectures
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.constraints import StoredAs
+from tacpipe.plugins.fields import build_dataclass as build_dataclass
 from tacpipe.plugins.fields import choices as choices
-from tacpipe.plugins.fields import filled as filled
 from tacpipe.plugins.stage import AnyStage, Presets, StoredParams
 from tacpipe.printable import excerpt
 
@@ -70,7 +70,7 @@ def fields(stage: AnyStage) -> Mapping[str, fields_of.Annotation]:
     return _fields(kinds(stage))
 
 
-def having(stage: AnyStage, field: str) -> list[str]:
+def choices_with(stage: AnyStage, field: str) -> list[str]:
     """Return the choices of the tag with which a param is used, or an empty list if it is always used."""
     name, alternatives = tag(stage), kinds(stage)
     owners = [kind for kind in alternatives if field in fields_of.hints(kind)]
@@ -167,7 +167,7 @@ def _field_value(value: Any, annotation: fields_of.Annotation) -> Any:
     return tuple(value) if origin is tuple else value
 
 
-def counting(stage: AnyStage, values: StoredParams) -> StoredParams:
+def used_params(stage: AnyStage, values: StoredParams) -> StoredParams:
     """Return the stored params that the chosen kind has, with current names; older versions stored those of all kinds.
 
     Returns all of them if the tag names no kind, such as an architecture that is not installed.
@@ -218,7 +218,10 @@ def read(union: Any, values: StoredParams, place: str) -> Any:
 
 
 def _convert_type(value: Any, annotation: Any, name: str, place: str) -> Any:
-    """Return ``value`` in the type of an annotation, without its constraints; raises `TacpipeError` for another type."""
+    """Return ``value`` in the type of an annotation without its constraints.
+
+    Raises `TacpipeError` if it has another type.
+    """
     kind = fields_of.bare(annotation)
     if get_origin(kind) is Literal:
         kind = typing.Union[tuple({type(choice) for choice in get_args(kind)})]  # noqa: UP007
@@ -254,20 +257,22 @@ def _current(alternatives: Sequence[Kind], values: StoredParams) -> tuple[Kind |
     name = _tag_name(alternatives) if len(alternatives) > 1 else None
     chosen = next((kind for kind in alternatives if name is None or _has_tag(kind, name, values)), None)
     upgrade = getattr(chosen, "upgrade", None)
-    values = values if upgrade is None else upgrade(values)
-    today = _today(tuple(kind for kind in (chosen, *alternatives) if kind is not None))
+    names = _current_names(tuple(kind for kind in (chosen, *alternatives) if kind is not None))
     current = {}
-    for stored, value in values.items():
-        field, choices = today.get(stored, (stored, {}))
+    for stored_name, value in (values if upgrade is None else upgrade(values)).items():
+        field, choices = names.get(stored_name, (stored_name, {}))
         current[field] = choices.get(value, value) if isinstance(value, str) else value
     return chosen, current
 
 
 @functools.cache
-def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]]]:
-    """Return the current name and choices of each stored name, from the first kind with that name."""
+def _current_names(kinds_in_order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]]]:
+    """Return the current field name, and the current choice by stored choice, of each stored name.
+
+    If several kinds have the name, the first in ``kinds_in_order`` determines them.
+    """
     current: dict[str, tuple[str, Mapping[str, str]]] = {}
-    for kind in order:
+    for kind in kinds_in_order:
         for field in fields_of.hints(kind):
             mark = _stored_as(kind, field)
             current.setdefault(mark.name, (field, {old: new for new, old in mark.choices.items()}))
@@ -318,6 +323,7 @@ def comments_of(kind: Kind) -> dict[str, str]:
 
 @functools.cache
 def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, fields_of.Annotation]:
+    """Return the annotation of each field; if the alternatives differ, one that accepts the values of each."""
     annotations: dict[str, list[fields_of.Annotation]] = {}
     for kind in alternatives:
         for name, annotation in fields_of.hints(kind).items():

@@ -118,10 +118,10 @@ def plugin_packages() -> dict[str, Path]:
 
 def package_of_stage(name: str) -> str | None:
     """Return the package that provides a stage, or None for tacpipe's own stages and unknown names."""
-    name = stage_name(name)
+    stage = stage_name(name)
     for group, prefix in (*PREFIXES.items(), (STAGES, "")):
-        if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
-            package = provider_of(group, name.removeprefix(prefix))
+        if stage.startswith(prefix) and stage.removeprefix(prefix) in entry_points()[group]:
+            package = provider_of(group, stage.removeprefix(prefix))
             return None if package is None else package.name
     return None
 
@@ -157,7 +157,7 @@ def _top_modules(entry_points_file: Path | None) -> set[str]:
 
 
 def _code_files(module: str) -> Iterator[tuple[str, Path]]:
-    """Yield every source file of a top-level module or package with its relative name. Imports nothing."""
+    """Yield the relative name and the path of every source file of a top-level module or package. Imports nothing."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
@@ -215,15 +215,15 @@ def commands() -> dict[str, str]:
     group, or "" if the stage or the group's module has its own. tacpipe's commands come first; commands that are not
     listed come last in alphabetical order.
     """
-    first: dict[str, str] = {}
+    stage_by_command: dict[str, str] = {}
     for name in reversed(stages()):
-        first[name.partition(".")[0]] = name
-    lines: dict[str, str] = {}
+        stage_by_command[name.partition(".")[0]] = name
+    summaries: dict[str, str] = {}
     for name, target in sorted(entry_points()[COMMANDS].items(), key=lambda item: (item[0] != OWN, item[0])):
         with contextlib.suppress(TacpipeError):  # an entry point that cannot be loaded affects only its own order
-            lines = {**lines, **_import(name, target)}
-    names = [*(name for name in lines if name in first), *sorted(set(first) - set(lines))]
-    return {name: lines.get(name) or _own_summary(name) or summary(first[name]) for name in names}
+            summaries = {**summaries, **_import(name, target)}
+    names = [*(name for name in summaries if name in stage_by_command), *sorted(set(stage_by_command) - set(summaries))]
+    return {name: summaries.get(name) or _own_summary(name) or summary(stage_by_command[name]) for name in names}
 
 
 def _own_summary(command: str) -> str:
@@ -289,7 +289,7 @@ def load(name: str) -> AnyStage:
 
 
 def load_step(name: str) -> AnyStage:
-    """Return the stage with this name, or its fit: ``compress.pca.fit`` is the fit of ``compress.pca``."""
+    """Return the stage with this name, or a stage's fit or part: ``compress.pca.fit`` is the fit of ``compress.pca``."""
     stage = load(stage_name(name))
     if name.endswith(FIT):
         assert stage.fit is not None
@@ -392,20 +392,27 @@ def load_encoder(name: str) -> Any:
 
 
 def _load_plugin(group: str, noun: str, name: Any) -> Any:
-    """Return the object of an entry point. ``name`` comes from a file or the user and may have any type."""
+    """Return the object of an entry point. ``name`` comes from a file or the user and may have any type.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
     targets = entry_points()[group]
     target = targets.get(str(name))
     if target is None:
         raise UsageError(f"There is no {noun} {plain(str(name))}; there are {', '.join(sorted(targets))}.")
     packages = _used_packages.get()
-    if (
-        packages is not None and group != MODELS
-    ):  # all architectures are loaded to collect a task's params, so their own packages are not recorded
-        packages.update(package.name for package in [provider_of(group, str(name))] if package is not None)
+    # all architectures are loaded to collect a task's params, so their own packages are not recorded
+    if packages is not None and group != MODELS and (package := provider_of(group, str(name))) is not None:
+        packages.add(package.name)
     return _import(name, target)
 
 
 def _import(name: str, target: str) -> Any:
+    """Return the object ``module:attribute`` that the entry point ``name`` refers to.
+
+    Raises `TacpipeError` if the module cannot be imported or has no such attribute, `MissingModuleError` if it needs a
+    module that is not installed.
+    """
     module, _, attribute = target.partition(":")
     try:
         loaded = importlib.import_module(module)
@@ -471,7 +478,7 @@ def is_named_after(module: str, stage_name: str) -> bool:
 
 
 def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | None:
-    """Return the definition of a function or of a class member in a module's syntax tree."""
+    """Return the definition of a function or of a class's method in a syntax tree, or None if it does not exist."""
     body = tree.body
     for name in names:
         kinds = ast.FunctionDef if name == names[-1] else ast.ClassDef

@@ -57,18 +57,23 @@ class StreamSelection:
         return replace(output, tables={stream: output.streams[stream] for stream in selected})
 
     def _select(self, recording: str, names: Iterable[str]) -> list[str]:
-        names = list(names)
-        requested = self._matching(recording, names, "--streams", self.streams) if self.streams else names
-        left_out = self._matching(recording, names, "--without", self.without)
-        selected = [name for name in names if name in requested and name not in left_out]
+        """Return the names of the selected streams, in order. Raises the errors of `narrow`."""
+        existing = list(names)
+        requested = self._matching(recording, existing, "--streams", self.streams) if self.streams else existing
+        left_out = self._matching(recording, existing, "--without", self.without)
+        selected = [name for name in existing if name in requested and name not in left_out]
         if not selected:
             raise TacpipeError(
-                f"{_recording_phrase(recording)} has no stream left; it has {', '.join(names)}. Select others."
+                f"{_recording_phrase(recording)} has no stream left; it has {', '.join(existing)}. Select others."
             )
         return selected
 
     @staticmethod
     def _matching(recording: str, names: Sequence[str], option: str, text: str) -> set[str]:
+        """Return the streams that match the patterns in the ``text`` of an option.
+
+        Raises `TacpipeError` for a name without wildcard that no stream has.
+        """
         matching: set[str] = set()
         for pattern in CommaList().items(text):
             matches = [name for name in names if fnmatchcase(name, pattern)]

@@ -52,7 +52,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     events = events_table(sealed, spooled)
     if events.num_rows:
         streams[EVENTS] = events.to_reader
-    shards = {name: _shard(store, name, batches) for name, batches in sorted(streams.items())}
+    shards = {name: _store_shard(store, name, batches) for name, batches in sorted(streams.items())}
     text = store.put(rig.text.encode(), durable=True).to_json()
     entry: RecordingEntry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
     files = {RIG: text}
@@ -60,18 +60,18 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
         with (spooled.folder / "bytes").open("rb") as spool:
             copy_spool = functools.partial(shutil.copyfileobj, spool)
             files[BYTES] = store.put_written(copy_spool, durable=True).to_json()
-    result: StoredResult = {"recordings": {"": entry}, "files": files}
+    stored_result: StoredResult = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
     provenance_entry: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - start_s, 4)),
         "irreplaceable": True,
     }
-    store.commit(identity, result, provenance_entry, durable=True)
-    output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
+    store.commit(identity, stored_result, provenance_entry, durable=True)
+    path, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
     names: list[str] = []  # names under which the recording was added; a retry appends another
 
     def add_recording() -> directory.DirectoryChange:
-        current = existing_manifest(output)
+        current = existing_manifest(path)
         recordings = {} if current is None else current.recordings
         existing_name = next((name for name, entry in recordings.items() if entry["shards"] == shards), None)
         if current is not None and existing_name is not None:  # an earlier run appended it and then crashed
@@ -86,12 +86,12 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             updated.content  # noqa: B018  (raises if a value cannot be written as JSON)
         except (ValueError, TypeError, KeyError) as error:  # never publish a manifest that readers reject
             raise TacpipeError(
-                f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
+                f"Recording {plain(name)} cannot be added to {path}: {plain(str(error), 200)}."
             ) from error
         names.append(name)
         return directory.DirectoryChange(updated, may_lack=_other_paths(updated, name, rig_name))
 
-    directory.change(store, output, add_recording)
+    directory.change(store, path, add_recording)
     return names[-1]
 
 
@@ -101,7 +101,10 @@ def _other_paths(manifest: Manifest, name: str, rig: str) -> set[str]:
 
 
 def _raise_empty(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
-    """Raise the error for a spool without samples. A spool without bytes is also removed."""
+    """Raise the error for a spool without samples, and remove the spool if it is also without bytes.
+
+    Raises `NothingError` if no bytes were received, else `TacpipeError`.
+    """
     received = sum(stream.received for stream in sealed.values())
     if not received and not spooled.damage:
         spooled.remove()
@@ -156,7 +159,11 @@ def _free_name(requested: str, existing_names: Iterable[str]) -> str:
     return name
 
 
-def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader]) -> Shard:
+def _store_shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader]) -> Shard:
+    """Store a stream as a shard, compare it with what was written, and return its entry.
+
+    Raises `DamagedError` if it differs.
+    """
     from tacpipe.io import columns, parquet
 
     rows: list[int] = []
@@ -175,19 +182,19 @@ def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader)
 
     if not stored.schema.equals(expected.schema):
         return False
-    pending: list[pa.RecordBatch] = []  # batches of the shard that are not compared yet
+    uncompared: list[pa.RecordBatch] = []  # batches of the shard that are not compared yet
     for batch in expected:
         count = batch.num_rows
-        while sum(part.num_rows for part in pending) < count:
+        while sum(part.num_rows for part in uncompared) < count:
             next_batch = next(stored, None)
             if next_batch is None:
                 return False
-            pending.append(next_batch)
-        table = pa.Table.from_batches(pending)
+            uncompared.append(next_batch)
+        table = pa.Table.from_batches(uncompared)
         if not _equal_tables(table.slice(0, count), pa.Table.from_batches([batch])):
             return False
-        pending = [part for part in table.slice(count).to_batches() if part.num_rows]
-    return not pending and next(stored, None) is None
+        uncompared = [part for part in table.slice(count).to_batches() if part.num_rows]
+    return not uncompared and next(stored, None) is None
 
 
 def _equal_tables(stored: pa.Table, expected: pa.Table) -> bool:

@@ -64,15 +64,15 @@ class Pace:
         """Exclude the time since the last read, which was spent on the device, from the next delay."""
         self._empty_ns = now_ns
 
-    def read(self, start_ns: int, stop_ns: int, timeout_ns: int, suspended_ns: int) -> Stall | None:
+    def add_read(self, start_ns: int, stop_ns: int, timeout_ns: int, suspended_ns: int) -> Stall | None:
         """Add a read and return the stall that ended with it, or None."""
-        asleep_ns, self._suspended_ns = suspended_ns - self._suspended_ns, suspended_ns
-        asleep_ns = asleep_ns if asleep_ns > STALL_NS else 0  # the two clocks are not read at the same instant
+        slept_ns, self._suspended_ns = suspended_ns - self._suspended_ns, suspended_ns
+        slept_ns = slept_ns if slept_ns > STALL_NS else 0  # the two clocks are not read at the same instant
         last_empty_ns, self._empty_ns = self._empty_ns, stop_ns
-        duration_ns = max(start_ns - last_empty_ns, stop_ns - start_ns - timeout_ns) + asleep_ns
+        duration_ns = max(start_ns - last_empty_ns, stop_ns - start_ns - timeout_ns) + slept_ns
         if duration_ns > STALL_NS:
             self._catching_up, self._stall_end_ns = True, stop_ns
-            return Stall(duration_ns, stop_ns - last_empty_ns + asleep_ns, asleep_ns)
+            return Stall(duration_ns, stop_ns - last_empty_ns + slept_ns, slept_ns)
         return None
 
     def has_caught_up(self, start_ns: int, stop_ns: int) -> bool:
@@ -94,7 +94,7 @@ class Stalls:
         self._suspended: list[tuple[int, int]] = []  # first timestamp after a suspension, duration of the suspension
 
     def add(self, note: StreamNote) -> StreamFault | None:
-        """Add a note, and return its event if it reports a stall."""
+        """Add a note; return its event if it reports a stall, else None."""
         stall = parse_stall(note.detail) if note.what == STALLED else None
         if note.what == CAUGHT_UP and self._windows:
             start_ns, end_ns, empty_ns = self._windows[-1]
@@ -104,12 +104,12 @@ class Stalls:
         if stall.late_ns:
             self._windows.append((note.t_ns, note.t_ns + MAX_CATCH_UP_NS, note.t_ns - stall.late_ns))
         self._suspended += [(note.t_ns, stall.suspended_ns)] if stall.suspended_ns else []
-        facts = [f"nothing was read for {stall.duration_ns / 1e9:.3f} s"]
-        facts += (
+        phrases = [f"nothing was read for {stall.duration_ns / 1e9:.3f} s"]
+        phrases += (
             [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
         )
-        facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
-        return StreamFault(note.t_ns, STALLED, detail="; ".join(facts))
+        phrases += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
+        return StreamFault(note.t_ns, STALLED, detail="; ".join(phrases))
 
     def __bool__(self) -> bool:
         """Return whether any timestamp may be late."""

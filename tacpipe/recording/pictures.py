@@ -81,6 +81,7 @@ class PictureHandler(BaseHTTPRequestHandler):
             self.send_error(404)
 
     def _send_page(self) -> None:
+        """Send a page with the images of all cameras."""
         figures = "".join(
             f'<figure><img src="/{quote(name)}" alt=""><figcaption>{html.escape(name)}</figcaption></figure>'
             for name in self.cameras
@@ -94,6 +95,7 @@ class PictureHandler(BaseHTTPRequestHandler):
         self.wfile.write(page)
 
     def _send_frames(self, watch: Watch) -> None:
+        """Send the frames of a camera, and the last one again after `IDLE_S`, until the browser disconnects."""
         self.send_response(200)
         self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
         self.send_header("Cache-Control", "no-store")

@@ -56,21 +56,17 @@ class CounterUnroller:
         self._may_have_restarted = self._last is not None
 
     def feed(self, raw: Int64s, t_ns: Times) -> UnrolledCounters:
-        """Unroll counters as sent (sample,), with the arrival of each in ns.
+        """Unroll counters as sent (sample,), with the arrival time of each in ns.
 
-        If two samples are further apart than half the counter's period, the arrival times determine how often it wrapped.
+        If two samples are further apart than half the counter's period, the arrival times determine how often it
+        wrapped.
         """
         if not len(raw):
             empty = np.zeros(0, dtype=bool)
             return UnrolledCounters(raw, raw, empty, empty, empty)
         if self._may_have_restarted and self._last is not None:
-            restarted, following = (
-                self._unroll_after_outage(int(raw[0]), int(t_ns[0]), *self._last),
-                self.feed(raw[1:], t_ns[1:]),
-            )
-            return UnrolledCounters(
-                *(np.concatenate([getattr(part, name) for part in (restarted, following)]) for name in NAMES)
-            )
+            parts = self._unroll_after_outage(int(raw[0]), int(t_ns[0]), *self._last), self.feed(raw[1:], t_ns[1:])
+            return UnrolledCounters(*(np.concatenate([getattr(part, name) for part in parts]) for name in NAMES))
         first = self._last is None
         last_raw, last_seq, last_ns = self._last or (int(raw[0]), int(raw[0]) // self.step, int(t_ns[0]))
         delta = self._signed_difference(np.diff(raw, prepend=last_raw))
@@ -91,12 +87,15 @@ class CounterUnroller:
     def _unroll_after_outage(
         self, raw: int, at_ns: int, last_raw: int, last_seq: int, last_ns: int
     ) -> UnrolledCounters:
-        """Unroll the first counter after an outage, which is a reset unless it agrees with the clock."""
-        half, rounds = self.modulus // 2, self.modulus // self.step
-        steps, remainder = divmod((raw - last_raw + half) % self.modulus - half, self.step)
+        """Unroll the first counter after an outage, which is a reset unless it agrees with the clock.
+
+        The counter as sent is ``raw``, which arrived ``at_ns``; ``last_…`` describe the sample before the outage.
+        """
+        half_period, samples_per_wrap = self.modulus // 2, self.modulus // self.step
+        steps, remainder = divmod((raw - last_raw + half_period) % self.modulus - half_period, self.step)
         expected = (at_ns - last_ns) * 1e-9 * self.rate_hz
         if self.rate_hz:
-            steps += rounds * round((expected - steps) / rounds)
+            steps += samples_per_wrap * round((expected - steps) / samples_per_wrap)
         agrees_with_clock = (
             abs(steps - expected) <= RESET_SLACK + CLOCK_TOLERANCE * expected
             if self.rate_hz
@@ -121,20 +120,24 @@ class CounterUnroller:
     def _unroll_rows(
         self, raw: Int64s, t_ns: Times, last_raw: int, last_seq: int, last_ns: int, *, first: bool
     ) -> UnrolledCounters:
+        """Unroll counters one by one, and classify each that is not the next: a gap, a repetition, a late sample, a reset.
+
+        ``last_…`` describe the previous sample; ``first``: there is none, and they are those of the first row.
+        """
         seq, missing = np.zeros(len(raw), dtype=np.int64), np.zeros(len(raw), dtype=np.int64)
         duplicate, late, reset = (np.zeros(len(raw), dtype=bool) for _ in range(3))
-        half = self.modulus // 2
+        half_period = self.modulus // 2
         for row, (value, at_ns) in enumerate(zip(raw.tolist(), t_ns.tolist(), strict=True)):
-            steps, remainder = divmod((value - last_raw + half) % self.modulus - half, self.step)
+            steps, remainder = divmod((value - last_raw + half_period) % self.modulus - half_period, self.step)
             expected = (at_ns - last_ns) * 1e-9 * self.rate_hz  # 0 without a declared rate
-            rounds = self.modulus // self.step
-            if expected > rounds / 2:
-                steps += rounds * round((expected - steps) / rounds)
-            continued, self._before_reset = self._steps_after_wrong_count(value), None
+            samples_per_wrap = self.modulus // self.step
+            if expected > samples_per_wrap / 2:
+                steps += samples_per_wrap * round((expected - steps) / samples_per_wrap)
+            steps_after_wrong, self._before_reset = self._steps_after_wrong_count(value), None
             if first:
                 first, steps = False, 0
-            elif continued and steps != 1:
-                steps = continued
+            elif steps_after_wrong and steps != 1:
+                steps = steps_after_wrong
                 reset[row], missing[row] = True, steps - 1
             elif (
                 remainder
@@ -240,7 +243,7 @@ class LinkReader:
         return batch
 
     def finish(self) -> Batch:
-        """Return the last samples and events of the stream."""
+        """Return the last samples and events of the stream; the losses that no counter resolved count in full."""
         batch = self._batch(*self._framer.flush())
         final_events = tuple(_event(loss, loss.frames) for loss in self._pending_losses)
         final_events += () if self._silence is None else (self._silence,)
@@ -249,11 +252,14 @@ class LinkReader:
         return replace(batch, events=batch.events + final_events)
 
     def _batch(self, runs: Sequence[FrameRun], losses: Sequence[FramingLoss]) -> Batch:
-        decoded = [(run, self.sensor.decode(run.frames)) for run in runs]
-        decoded = [(run, samples) for run, samples in decoded if len(samples)]
+        """Return the samples and faults of new frames and framing losses, without the samples that are duplicates."""
+        pairs = ((run, self.sensor.decode(run.frames)) for run in runs)
+        decoded = [(run, samples) for run, samples in pairs if len(samples)]
         stamps = [run.t_ns if samples.rows is None else run.t_ns[samples.rows] for run, samples in decoded]
         t_ns = np.concatenate(stamps) if stamps else np.zeros(0, dtype=np.int64)
-        self.frames += sum(len(s) if s.rows is None else len(np.unique(s.rows)) for _, s in decoded)
+        self.frames += sum(
+            len(samples) if samples.rows is None else len(np.unique(samples.rows)) for _, samples in decoded
+        )
         decoded_samples = [samples for _, samples in decoded]
         seq, device_seq, t_device_ns = (
             _concatenate(decoded_samples, name) for name in ("seq", "device_seq", "t_device_ns")
@@ -294,7 +300,10 @@ class LinkReader:
         return unrolled
 
     def _counter_faults(self, counted: UnrolledCounters, t_ns: Times) -> list[StreamFault]:
-        """Return the faults of a batch with a counter. The counter shows how many frames each loss cost."""
+        """Return the faults of a batch whose sensor has a counter.
+
+        The counter shows how many frames each pending framing loss cost.
+        """
         events: list[StreamFault] = []
         fault_rows = np.flatnonzero((counted.missing > 0) | counted.duplicate | counted.late | counted.reset)
         for row in fault_rows.tolist():
@@ -370,6 +379,8 @@ def _device_events(skipped: UnrolledCounters, counted: UnrolledCounters, t_ns: T
 
 
 def _select_rows(batch: Batch, rows: Bools) -> Batch:
+    """Return the rows of a batch for which ``rows`` (sample,) is True, with all of its events."""
+
     def select(values: Times | None) -> Times | None:
         return None if values is None else values[rows]
 

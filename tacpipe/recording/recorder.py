@@ -66,7 +66,10 @@ class Recorder:
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
-        """Keep all streams open in the block. Raises `DeviceError` with a sentence for each stream that cannot be opened."""
+        """Keep all streams open in the block.
+
+        Raises `DeviceError` with a sentence for each stream that cannot be opened.
+        """
         started: list[Station] = []
         try:
             failed = []
@@ -167,13 +170,13 @@ class Recorder:
             self._note_tick()
             if clock.now_ns() - self._punctual_since_ns < DRAIN_S * 1e9:
                 self._drain()
-            last = {name: station.end_recording() for name, station in self.stations.items()}
-            for name, blocks in last.items():
+            last_blocks = {name: station.end_recording() for name, station in self.stations.items()}
+            for name, blocks in last_blocks.items():
                 _spool_blocks(spool, name, blocks)
             stopped.set()
             syncing.join()
             spool.finish()
-            for name, blocks in last.items():
+            for name, blocks in last_blocks.items():
                 self._watch(name, blocks)  # the next recording may need them as preroll
 
     def lost(self) -> list[str]:
@@ -210,7 +213,7 @@ class Recorder:
                 return
 
     def _note_tick(self) -> None:
-        """Store the time of this tick and add its delay: after a delay, bytes may be queued in the links."""
+        """Record the time of this tick and its delay: after a delay, bytes may be queued in the links."""
         now_ns = clock.now_ns()
         elapsed_ns, self._last_tick_ns = now_ns - (self._last_tick_ns or now_ns), now_ns
         overdue_ns = elapsed_ns - round(TICK_S * 1e9)
@@ -227,6 +230,7 @@ class Recorder:
             retained.popleft()
 
     def _explain_silence(self, name: str) -> str:
+        """Return the error of a stream that sent no sample: of its link, of its driver, or that it is silent."""
         station, watch = self.stations[name], self.watches[name]
         if station.error is not None:
             return str(station.error)
@@ -250,8 +254,8 @@ def _retained_blocks(
     recent: list[Chunks | StreamNote] = []
     for block in blocks:
         if isinstance(block, Chunks):
-            block = block.since(start_ns)
-            recent += [block] if len(block.size) else []
+            remaining = block.since(start_ns)
+            recent += [remaining] if len(remaining.size) else []
         elif block.t_ns >= start_ns:
             recent.append(block)
     return recent
@@ -290,6 +294,7 @@ def _complete_stream(stream: RigStream) -> RigStream:
 
 
 def _read_options(stream: RigStream) -> Options:
+    """Return the options that a device reports. Raises `DeviceError` if it reports none within `OPTIONS_S`."""
     chunks: list[tuple[int, bytes]] = []
     deadline_s = clock.now_s() + OPTIONS_S
     with closing(opening.open_link(stream.address, stream.sensor, stream.name)) as link:

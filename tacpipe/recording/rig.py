@@ -87,7 +87,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
         raise UsageError(f"{source} lists no stream; each is a table [[stream]] with name, sensor and transport.")
     streams: dict[str, RigStream] = {}
     for number, table in enumerate(tables, start=1):
-        stream = _stream(table, f"{source}, stream {_stream_label(table.get('name', number))}")
+        stream = _parse_stream(table, f"{source}, stream {_stream_label(table.get('name', number))}")
         if stream.name in streams:
             raise UsageError(f"{source} has two streams named {stream.name}; names must be unique.")
         streams[stream.name] = stream
@@ -104,7 +104,8 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
     return Rig(streams, master, labels, _table(contents, "emulate", source), _table(contents, "live", source), text)
 
 
-def _stream(table: Values, source: str) -> RigStream:
+def _parse_stream(table: Values, source: str) -> RigStream:
+    """Return a stream of a rig file. Raises `UsageError` for a missing or invalid key, option or address."""
     _refuse_unknown(table, KEYS, source)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
@@ -135,7 +136,7 @@ def _table(table: Values, key: str, source: str) -> Values:
 
 def build_sensor(kind: str, options: Values, source: str) -> Sensor:
     """Return a sensor with these options. Raises `UsageError` for an unknown option or a value of the wrong type."""
-    sensor: Sensor = params.filled(registry.load_sensor(kind), options, source, "option")
+    sensor: Sensor = params.build_dataclass(registry.load_sensor(kind), options, source, "option")
     return sensor
 
 

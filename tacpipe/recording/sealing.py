@@ -102,6 +102,7 @@ class Decoded:
         return pa.RecordBatchReader.from_batches(full_schema, stamped_batches())
 
     def _spill_tables(self) -> None:
+        """Move the tables in memory to the spill file."""
         import pyarrow as pa
 
         if self._in_memory:
@@ -160,10 +161,10 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
 
     sensor = rig.streams[name].sensor
     decoded, stalls = Decoded(sensor.fields(), spill or Spill(MEMORY_BYTES)), Stalls()
-    account = _read(_joined_blocks(spooled, name), sensor, decoded, stalls)
+    tally = _decode_blocks(_joined_blocks(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
-    events = account.events + _silent_end(sensor, last_ns, end_ns)
-    crashed = _count_unspooled(spooled, name, account.chunks, account.bytes)
+    events = tally.events + _end_silence(sensor, last_ns, end_ns)
+    crashed = _count_unspooled(spooled, name, tally.chunks, tally.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         events.append(StreamFault(last_ns, CRASH, bytes=crashed[1], detail=detail))
@@ -176,8 +177,8 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
         (stamping.utc_ns(decoded.first_ns), stamping.utc_ns(decoded.last_ns)) if decoded.count else None,
         events,
         sum(event.frames for event in events),
-        received=account.bytes,
-        undecoded=account.undecoded,
+        received=tally.bytes,
+        undecoded=tally.undecoded,
         crashed=crashed,
         uncertain=late,
     )
@@ -193,12 +194,15 @@ class _Read:
     undecoded: int = 0  # bytes
 
 
-def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
-    """Decode the blocks of a stream. Samples are added to ``decoded``, delays of the program to ``stalls``."""
-    account, reader = _Read(), LinkReader(sensor)
+def _decode_blocks(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
+    """Decode the blocks of a stream, and return its counts and events.
+
+    Samples are added to ``decoded``, and delays of the program to ``stalls``.
+    """
+    tally, reader = _Read(), LinkReader(sensor)
 
     def add(batch: Batch) -> None:
-        account.events.extend(batch.events)
+        tally.events.extend(batch.events)
         decoded.add(batch)
 
     was_lost = False
@@ -209,22 +213,22 @@ def _read(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decoded: Decode
                 add(reader.end_link())
             if block.what in (STALLED, CAUGHT_UP):
                 stall = stalls.add(block)
-                account.events += [] if stall is None else [stall]
+                tally.events += [] if stall is None else [stall]
             elif block.what != OPENED or was_lost:  # opening before the recording is not an event
-                account.events.append(_note_event(block, sensor))
+                tally.events.append(_note_event(block, sensor))
             continue
-        account.chunks += len(block.size)
-        account.bytes += len(block.data)
+        tally.chunks += len(block.size)
+        tally.bytes += len(block.data)
         try:
             add(reader.feed(block))
         except Exception as error:  # a driver's error does not stop the other streams and blocks
-            account.undecoded += len(block.data)
+            tally.undecoded += len(block.data)
             reason = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            account.events.append(StreamFault(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
+            tally.events.append(StreamFault(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
             reader = LinkReader(sensor)
         decoded.spill_if_large()
     add(reader.finish())
-    return account
+    return tally
 
 
 def _count_unspooled(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
@@ -239,8 +243,8 @@ def _note_event(note: StreamNote, sensor: Sensor) -> StreamFault:
     return StreamFault(note.t_ns, note.what, dropped, detail=note.detail)
 
 
-def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[StreamFault]:
-    """Return the event of a stream that ended well before the recording, which no counter shows; otherwise nothing."""
+def _end_silence(sensor: Sensor, last_ns: int, end_ns: int) -> list[StreamFault]:
+    """Return the event of a stream that ended well before the recording, which no counter shows; else an empty list."""
     silent_s = (end_ns - last_ns) / 1e9
     if not sensor.awaited or silent_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
         return []
@@ -268,8 +272,8 @@ def _joined_blocks(spooled: Spooled, name: str) -> Iterator[Chunks | StreamNote]
         yield Chunks.concatenate(pending)
 
 
-def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[StreamFault, str]]:
-    """Return the event of a recording that was not completed, with its duration; otherwise nothing."""
+def _cut_off_events(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[StreamFault, str]]:
+    """Return the event of a recording that was not completed, with the stream name ""; otherwise an empty list."""
     spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     if spooled.ended == COMPLETED or not spans_ns:
         return []
@@ -288,12 +292,12 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     from tacpipe.channels import schema
 
     rows = sorted((event, name) for name, stream in sealed.items() for event in stream.events)
-    rows += _cut_off(sealed, spooled)
+    rows += _cut_off_events(sealed, spooled)
     rows = [
         (StreamFault(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=damage.bytes), "")
         for damage in spooled.damage
     ] + rows
-    count = {"unit": "1", "quantity": "count"}
+    count_metadata = {"unit": "1", "quantity": "count"}
     return pa.Table.from_arrays(
         [
             pa.array([event.t_ns for event, _ in rows], pa.int64()),
@@ -308,7 +312,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
                 schema.time_field(),
                 pa.field("stream", pa.string()),
                 pa.field("cause", pa.string()),
-                pa.field("frames", pa.int64(), metadata=count),
+                pa.field("frames", pa.int64(), metadata=count_metadata),
                 pa.field("bytes", pa.int64(), metadata={"unit": "byte", "quantity": "count"}),
                 pa.field("detail", pa.string()),
             ]

@@ -89,7 +89,10 @@ def find_next(handle: int, content: mmap.mmap, offset: int) -> int:
 
 
 def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | StreamNote | None:
-    """Return the content of a block, or None if it is invalid although its checksum is right."""
+    """Return the content of a block of ``count`` chunks, or None if it is invalid although its checksum is right.
+
+    The kind is `CHUNKS` or `NOTE`.
+    """
     try:
         if kind == NOTE:
             entry = json.loads(body)
@@ -109,7 +112,7 @@ RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice 
 
 
 def read_clocks() -> spool_folders.ClockReading:
-    """Return the time of the monotonic clock and of UTC at one instant, in ns. The quickest of five readings is used."""
+    """Return the time of the monotonic clock and of UTC at one instant, in ns; the quickest of five readings."""
     readings = []
     for _ in range(5):
         before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -132,7 +135,7 @@ class Spool:
             entry: spool_folders.SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # no other process recovers a locked spool
-            self._tally = _tally(self.folder, len(streams))
+            self._tally = _create_tally(self.folder, len(streams))
             content = json.dumps(entry, sort_keys=True).encode()
             write_whole(str(self.folder / "header.json"), content, str(self.folder / ".header.json"))
             for folder in (self.folder, self.folder.parent):
@@ -198,7 +201,8 @@ class Spool:
             self._file = -1
 
 
-def _tally(folder: Path, streams: int) -> mmap.mmap:
+def _create_tally(folder: Path, streams: int) -> mmap.mmap:
+    """Return the mapped file of the totals of all streams, filled with zeros."""
     handle = os.open(folder / "tally", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
     try:
         # Allocate the file first: a write into a hole of a mapped file kills the process if the disk is full.
@@ -237,6 +241,10 @@ class Spooled:
     """
 
     def __init__(self, folder: Path, owners: frozenset[int] | None = None) -> None:
+        """Read the header of the spool in ``folder``. Raises `TacpipeError` if it is missing or cannot be read.
+
+        With ``owners``, files of users with other ids are rejected.
+        """
         self.folder, self._owners = folder, owners
         try:
             with self._open("header.json") as file:
@@ -300,6 +308,7 @@ class Spooled:
                 start = stop
 
     def _add_damage(self, offset: int, size: int) -> None:
+        """Add unreadable bytes to ``damage``, joined to the previous entry if they follow it."""
         last = self.damage[-1] if self.damage else None
         if last is not None and last.offset + last.bytes == offset:
             self.damage[-1] = Damage(last.offset, last.bytes + size)
@@ -322,7 +331,7 @@ class Spooled:
 
     def remove(self) -> None:
         """Remove the spool. Call it after its content is sealed."""
-        spool_folders.remove(self.folder)
+        spool_folders.remove_spool(self.folder)
 
     def keep(self) -> Path:
         """Move the sealed spool to the store's folder of retained spools, and return its new path.

@@ -66,7 +66,7 @@ def refuse_link(store: Path) -> None:
         )
 
 
-def owners(store: Path) -> dict[Path, int]:
+def find_owners(store: Path) -> dict[Path, int]:
     """Return the user id of each spool by its folder. Raises `TacpipeError` if the folder of spools is a link."""
     refuse_link(store)
     owner_ids = {}
@@ -78,10 +78,13 @@ def owners(store: Path) -> dict[Path, int]:
     return owner_ids
 
 
-def abandoned(store: Path) -> list[Path]:
-    """Return the folders of this user's spools that no process writes or seals, oldest first."""
+def find_abandoned(store: Path) -> list[Path]:
+    """Return the folders of this user's spools that no process writes or seals, oldest first.
+
+    Removes spools without a header whose process has ended.
+    """
     folders = []
-    owner_ids = owners(store)
+    owner_ids = find_owners(store)
     own_ids = own_user_ids(store / FOLDER, owner_ids.values())
     for folder in [folder for folder, owner in owner_ids.items() if owner in own_ids]:
         try:
@@ -90,7 +93,7 @@ def abandoned(store: Path) -> list[Path]:
                 if is_locked and (folder / "header.json").exists():
                     folders.append((-age_s, folder))
                 elif is_locked and age_s > STARTUP_S:  # its process ended before the recording started or after sealing
-                    remove(folder)
+                    remove_spool(folder)
             if not is_locked and age_s > STARTUP_S:
                 folder.rmdir()  # fails for a folder that is not empty
         except (FileNotFoundError, NotADirectoryError):
@@ -120,7 +123,7 @@ def locked(folder: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def remove(folder: Path) -> None:
+def remove_spool(folder: Path) -> None:
     """Remove the files of a spool, and its folder unless it contains other files."""
     with contextlib.suppress(FileNotFoundError):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
@@ -147,7 +150,7 @@ def output_path(store: Store, dataset: Path) -> str:
     return str(path.relative_to(project) if project is not None and path.is_relative_to(project) else path)
 
 
-def destination(header: SpoolHeader, store: Store, opened: Path | None) -> Path:
+def find_destination(header: SpoolHeader, store: Store, opened: Path | None) -> Path:
     """Return the dataset to which a spool is appended.
 
     Raises `TacpipeError` unless it is the output of this command (``opened``), or in the project of the store or of the

@@ -109,7 +109,7 @@ class Station:
         return self._link is None or self._empty_ns >= since_ns
 
     def tare(self) -> bool:
-        """Zero the device at its present reading. Returns False if it has no such command.
+        """Zero the device at its present reading; return whether it has a command for that.
 
         Raises `DeviceError` if the link is lost or the device does not reply.
         """
@@ -149,6 +149,7 @@ class Station:
                 link.close()
 
     def _open(self) -> None:
+        """Open the link and complete the sensor's opening dialogue. Raises `DeviceError` if that fails."""
         sensor = self.stream.sensor
         link = opening.open_link(self.stream.address, sensor, self.stream.name)
         try:
@@ -164,6 +165,7 @@ class Station:
         self._add_packets(packets)
 
     def _run(self) -> None:
+        """Read the link, and reopen it after each loss, until the station stops."""
         while not self._stopping.is_set():
             try:
                 if self._link is None:
@@ -175,6 +177,7 @@ class Station:
                 self._handle_loss(DeviceError(f"Stream {self.stream.name} failed: {type(error).__name__}: {error}"))
 
     def _handle_loss(self, error: TacpipeError) -> None:
+        """Close the link, report the loss, and wait before the next attempt, each time twice as long."""
         link, self._link = self._link, None
         self.error = error
         if link is not None:
@@ -222,7 +225,7 @@ class Station:
         start_ns = clock.now_ns()
         packets = link.read(timeout_s)
         stop_ns = clock.now_ns()
-        stall = pace.read(start_ns, stop_ns, round(timeout_s * 1e9), clock.suspended_ns())
+        stall = pace.add_read(start_ns, stop_ns, round(timeout_s * 1e9), clock.suspended_ns())
         at_ns = packets[0][0] if packets else stop_ns
         if stall is not None:
             late_ns = 0 if link.kernel_stamped else stall.late_ns
@@ -248,7 +251,10 @@ class Station:
         return previous_s
 
     def _poll(self, link: Link, request: bytes, pace: Pace) -> None:
-        """Read a device that sends one frame per request, at the sensor's rate. A request waits for the previous reply."""
+        """Read a device that sends one frame per request, at the sensor's rate.
+
+        Each request waits for the previous reply.
+        """
         period_s = 1.0 / self.stream.sensor.rate_hz
         due_s = time.monotonic()
         while not self._stopping.is_set():
@@ -286,22 +292,22 @@ class Station:
         accepted = [packet for packet in packets if self.stream.sensor.accepts(packet[1])]
         with self._lock:
             self._refused += len(packets) - len(accepted)
-            packets = accepted
-            if not packets:
+            if not accepted:
                 return
-            self._entries.extend(packets)
+            self._entries.extend(accepted)
             if self._tally is not None:
-                self._chunks += len(packets)
-                self._bytes += sum(len(data) for _, data in packets)
-                self._tally(self._chunks, self._bytes, packets[-1][0])
+                self._chunks += len(accepted)
+                self._bytes += sum(len(data) for _, data in accepted)
+                self._tally(self._chunks, self._bytes, accepted[-1][0])
             if self.listener is not None:
-                self._notify(Chunks.from_pairs(packets))
+                self._notify(Chunks.from_pairs(accepted))
 
     def _notify(self, block: Chunks | StreamNote) -> None:
         if self.listener is not None:
             self.listener(block)
 
     def _take_blocks(self) -> list[Chunks | StreamNote]:
+        """Remove and return all stored packets and notes, in order of time."""
         blocks: list[Chunks | StreamNote] = []
         while self._notes:
             note = self._notes.popleft()
@@ -323,7 +329,7 @@ INVISIBLE_OPTIONS = ("rate_hz", "baud")  # options that do not change the frames
 def explain_silence(stream: RigStream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
     """Return an error for a stream that did not receive ``awaited``: the device, the problem, and what to do.
 
-    ``heard`` has the bytes that were received instead. ``reply`` states that a reply was awaited: frames of the sensor then
+    ``heard`` has the bytes that were received instead. With ``reply``, a reply was awaited: frames of the sensor then
     show that the device does not receive requests.
     """
     joined = Chunks.concatenate(list(heard))
@@ -339,8 +345,8 @@ def explain_silence(stream: RigStream, awaited: str, heard: Iterable[Chunks], *,
     explanation = _explain_bytes(stream, joined, reply=reply)
     if explanation:
         return f"{about} {explanation}"
-    at = f"is set to another rate than {stream.sensor.baud} baud, or " if serial else ""
-    return f"{about} The device {at}uses another protocol; {probe} tries all supported sensors."
+    setting = f"is set to another rate than {stream.sensor.baud} baud, or " if serial else ""
+    return f"{about} The device {setting}uses another protocol; {probe} tries all supported sensors."
 
 
 def _explain_bytes(stream: RigStream, heard: Chunks, *, reply: bool) -> str:

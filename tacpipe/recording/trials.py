@@ -57,7 +57,8 @@ class RecordingPlan:
 
 def recording_name(name: str | None) -> str:
     """Return the name of a recording, by default the current time. Raises `UsageError` for an invalid file name."""
-    name = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    if not name:
+        return time.strftime("%Y%m%d-%H%M%S", time.gmtime())
     if not NAME.fullmatch(name) or not spool_folders.is_name(name):
         raise UsageError(
             f"--name {name!r} is not a valid file name. Use letters, digits, _, - and dots, without a dot in front."
@@ -99,7 +100,7 @@ def run(
 ) -> tuple[list[Recorded], list[str]]:
     """Record the trials of ``plan`` until ``stopping`` is true or a stream is lost.
 
-    Returns the recordings, and a sentence for each lost stream.
+    Returns the recordings, and a sentence for each lost stream. Raises the errors of `appending.append`.
     """
     recordings: list[Recorded] = []
     tap = triggers.MessageTrigger(recorder.watches) if "tap" in (plan.start, plan.stop) else None
@@ -112,7 +113,7 @@ def run(
             recorder.run(lambda: stopping() or starts(), lambda: view.show(waiting))  # noqa: B023
             if stopping():
                 break
-            recording, lost = _record(recorder, store, plan, trial, stops, view, stopping)
+            recording, lost = _record_trial(recorder, store, plan, trial, stops, view, stopping)
             recordings.append(recording)
             if lost or stopping():
                 return recordings, lost
@@ -121,7 +122,11 @@ def run(
 
 def _keys(plan: RecordingPlan) -> contextlib.AbstractContextManager[triggers.Keys]:
     """Return the keyboard's keys if a key starts or stops trials. Otherwise other programs can use the terminal."""
-    return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
+    return (
+        triggers.watch_keys()
+        if "key" in (plan.start, plan.stop)
+        else contextlib.nullcontext(lambda *, must=False: False)
+    )
 
 
 def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
@@ -138,10 +143,10 @@ def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
         raise TacpipeError(f"Its rig file is {excerpt(rig_text)}; it must be text.")
     rig = rig_of.parse(rig_text, f"The rig file in {folder}")
     spool_folders.check_header(spooled.header, rig.streams)
-    return _seal(store, spool_folders.destination(spooled.header, store, opened), spooled, rig)
+    return _seal(store, spool_folders.find_destination(spooled.header, store, opened), spooled, rig)
 
 
-def _record(
+def _record_trial(
     recorder: Recorder,
     store: Store,
     plan: RecordingPlan,
@@ -150,6 +155,10 @@ def _record(
     view: RigView,
     stopping: EndRequest,
 ) -> tuple[Recorded, list[str]]:
+    """Record one trial until its end, seal it, and return it with a sentence for each lost stream.
+
+    ``stops`` returns whether the trial should end. An error of sealing names the spool and how to recover it.
+    """
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
     header: RecordingHeader = {
@@ -190,6 +199,7 @@ def _record(
 
 
 def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
+    """Seal a spool, append it to the dataset ``output``, and remove it or move it to the retained spools."""
     sealed = sealing.seal(spooled, rig)
     with store.at_work():
         name = appending.append(store, output, spooled, rig, sealed)
@@ -197,9 +207,9 @@ def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     spooled.remove()
     rows = {name: stream.rows for name, stream in sealed.items()}
     spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
-    first, last = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
+    seconds = (max(last for _, last in spans_ns) - min(first for first, _ in spans_ns)) / 1e9
     lost = {name: stream.lost for name, stream in sealed.items()}
-    return Recorded(name, (last - first) / 1e9, rows, lost, spooled.ended, retained)
+    return Recorded(name, seconds, rows, lost, spooled.ended, retained)
 
 
 def _triggers(
@@ -240,7 +250,7 @@ def recover_spools(store: Store, output: Path | None) -> Iterator[Recorded | Uns
 
     A spool that cannot be sealed is retained; the others are sealed. ``output`` is the dataset of the command.
     """
-    for folder in spool_folders.abandoned(store.root):
+    for folder in spool_folders.find_abandoned(store.root):
         try:
             with spool_folders.locked(folder) as is_locked:
                 if not is_locked:
@@ -259,7 +269,7 @@ def recover_spools(store: Store, output: Path | None) -> Iterator[Recorded | Uns
 def spools_of_others(store: Store) -> dict[Path, str]:
     """Return the owners' names of other users' spools in a shared store, by folder."""
     with contextlib.suppress(OSError):  # a failed disk has already been reported
-        owners = spool_folders.owners(store.root)
+        owners = spool_folders.find_owners(store.root)
         own_ids = spool_folders.own_user_ids(store.root / spool_folders.FOLDER, owners.values())
         return {folder: spool_folders.user_name(owner) for folder, owner in owners.items() if owner not in own_ids}
     return {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import select
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -34,8 +35,11 @@ class Keys(Protocol):
 
 
 @contextlib.contextmanager
-def keys() -> Iterator[Keys]:
-    """Yield a function that detects whether Enter or the space bar was pressed."""
+def watch_keys() -> Iterator[Keys]:
+    """Yield a function that returns whether Enter or the space bar was pressed since its last call.
+
+    With ``must``, that function raises `UsageError` if standard input is closed, so that no key can be pressed.
+    """
     try:
         source = sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):  # standard input is missing or closed
@@ -74,14 +78,16 @@ def keys() -> Iterator[Keys]:
 
 
 def _find_key(typed: bytes, *, lines: bool) -> tuple[int, bool]:
-    r"""Return how many typed bytes are consumed, and whether one of them is Enter or the space bar.
+    r"""Return the number of typed bytes that are consumed, and whether one of them is Enter or the space bar.
+
+    With ``lines``, only Enter counts.
 
     >>> _find_key(b"ab  ", lines=False), _find_key(b"go", lines=True), _find_key(b"go\n\n", lines=True)
     ((3, True), (0, False), (3, True))
     """
-    positions = [start for start in (typed.find(key) for key in ((b"\n",) if lines else (b"\n", b" "))) if start >= 0]
-    if positions:
-        return min(positions) + 1, True
+    match = re.search(rb"\n" if lines else rb"[\n ]", typed)
+    if match:
+        return match.end(), True
     return (0 if lines else len(typed)), False
 
 
@@ -89,6 +95,10 @@ class ContactTrigger:
     """Detect contact and release by the tactile channels of all streams."""
 
     def __init__(self, watches: Mapping[str, Watch], threshold: float) -> None:
+        """Watch the tactile channels of all streams. Raises `UsageError` if there is none.
+
+        ``threshold`` is the distance from the rest level that counts as a contact, in the channel's unit.
+        """
         tactile = {
             name: [position for position, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
         }
@@ -101,7 +111,10 @@ class ContactTrigger:
         self._touched_s: float | None = None
 
     def touched(self) -> bool:
-        """Return whether a tactile channel differs from its rest level by more than the threshold."""
+        """Return whether a tactile channel differs from its rest level by more than the threshold.
+
+        Stores the time of contact.
+        """
         for name, positions in self._channels.items():
             watch = self._watches[name]
             if watch.newest is None or watch.rest_level is None:
@@ -121,6 +134,7 @@ class MessageTrigger:
     """Detect messages of other programs that start or stop a trial."""
 
     def __init__(self, watches: Mapping[str, Watch]) -> None:
+        """Watch the streams that receive messages. Raises `UsageError` if there is none."""
         self._watches = [watch for watch in watches.values() if watch.stream.kind == TAP]
         if not self._watches:
             raise UsageError(

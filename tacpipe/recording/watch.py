@@ -69,7 +69,7 @@ class Watch:
                 self._reader = LinkReader(self.stream.sensor)
 
     def figures(self, now_ns: int) -> Figures:
-        """Return the figures at ``now_ns`` on the monotonic clock."""
+        """Return the figures over the last `WINDOW_NS` before ``now_ns`` on the monotonic clock."""
         self._drop_old(now_ns)
         t_ns = np.concatenate([stamps for stamps, _ in self._recent] or [np.zeros(0, dtype=np.int64)])
         steps_ns = np.diff(t_ns)
@@ -88,6 +88,7 @@ class Watch:
         self._rest_samples, self.rest_level = [], None
 
     def _add_batch(self, batch: Batch) -> None:
+        """Update the newest values, the window of rate and jitter, and the rest level."""
         if not len(batch):
             return
         self.samples += len(batch)
@@ -175,6 +176,7 @@ class RigView:
                 terminal.note(footer_line)
 
     def _render(self, state: str, figures: Mapping[str, Figures]) -> Any:
+        """Return a table of the figures, the footer and the heat maps for the terminal."""
         from rich.console import Group
         from rich.table import Table
         from rich.text import Text
@@ -190,7 +192,10 @@ class RigView:
         return Group(table, *(Text(printable.shown(footer_line)) for footer_line in self._footer()), *maps)
 
     def _heat_map(self, name: str) -> list[Any]:
-        """Return the tactile channels of a stream as cells, coloured by the distance of each from its rest level."""
+        """Return the heat map of a stream as (text, style) pairs and line breaks; an empty list without a rest level.
+
+        Colours show the distance of each tactile channel from its rest level, relative to the largest so far.
+        """
         watch, positions = self._watches[name], self._tactile[name]
         if watch.newest is None or watch.rest_level is None:
             return []

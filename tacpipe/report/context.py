@@ -64,7 +64,7 @@ class ReportResult(Generic[Config]):
     @cached_property
     def params(self) -> Settings:
         """The training params that the model's architecture uses."""
-        return cast("Settings", params_of.counting(registry.load(self.STAGE), self.given))
+        return cast("Settings", params_of.used_params(registry.load(self.STAGE), self.given))
 
     @property
     def given(self) -> Settings:

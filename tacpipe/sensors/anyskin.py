@@ -68,6 +68,7 @@ class AnySkin(Sensor):
         return ByteFramer(Framing(tail=TAIL, size=size, check=_are_plausible, lock=3, weak=True))
 
     def _is_line(self, line: bytes) -> bool:
+        """Return whether a line has the right number of finite values of plausible size."""
         try:
             numbers = list(map(float, line.split()))
         except ValueError:

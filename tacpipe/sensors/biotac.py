@@ -56,6 +56,7 @@ class BioTac(Sensor):
     baud: int = 921600  # baud rate of the bridge
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` if an option has a value that the bridge does not support."""
         if not 1 <= self.fingers <= MAX_FINGERS:
             raise UsageError(f"biotac: fingers is {self.fingers}; it must be between 1 and {MAX_FINGERS}.")
         if self.rate_hz != WORD_HZ / WORDS:

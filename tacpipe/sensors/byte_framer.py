@@ -66,12 +66,19 @@ class ByteFramer:
         runs, losses = self._scan(at_end=True)
         remaining = len(self._text.data)
         if remaining:
-            complete = self._locked and bool(self._last_size) and remaining >= self._last_size
-            losses.append(self._lose(0, remaining, UNCONFIRMED if complete else CUT if self._has_frames else START))
+            cause = CUT if self._has_frames else START
+            if self._locked and self._last_size and remaining >= self._last_size:  # a complete frame
+                cause = UNCONFIRMED
+            losses.append(self._lose(0, remaining, cause))
             self._text.cut(remaining)
         return runs, losses
 
     def _scan(self, *, at_end: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
+        """Return the frames and losses in the buffered bytes, and remove these bytes.
+
+        Frames that following bytes must confirm stay in the buffer, unless the stream is ``at_end`` and they have a
+        checksum.
+        """
         runs: list[FrameRun] = []
         losses: list[FramingLoss] = []
         offset, size = 0, len(self._text.data)
@@ -99,49 +106,53 @@ class ByteFramer:
         return runs, losses
 
     def _add_runs(self, spans: Sequence[Span], unconfirmed: int, runs: list[FrameRun], offset: int) -> int:
-        """Append a chain without its last ``unconfirmed`` frames to ``runs``, and return the offset of those frames."""
+        """Append a chain without its last ``unconfirmed`` frames to ``runs``, and return the offset of those frames.
+
+        The chain starts at ``offset``.
+        """
         confirmed = -unconfirmed
         for _, _, count in spans:
             confirmed += count
-        for start, size, count in spans:
-            count = min(count, confirmed)
+        stop = offset
+        for start, size, span_count in spans:
+            count = min(span_count, confirmed)
             if count <= 0:
                 break
             confirmed -= count
-            offset = start + count * size
+            stop = start + count * size
             runs.append(
-                FrameRun(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, offset, size)))
+                FrameRun(self._frames(start, size, count), self._text.arrivals(range(start + size - 1, stop, size)))
             )
             self.account.framed += count * size
             self._last_size = size
-        return offset
+        return stop
 
     def _chain(self, offset: int, limit: int | None = None) -> tuple[list[Span], int, bool]:
-        """Return the consecutive good frames from ``offset`` on, their end, and whether no frame can start there.
+        """Return the consecutive good frames from ``offset`` on as spans, their end, and whether no frame can start there.
 
-        The frames are spans (start, size, count). ``limit`` is the largest number of frames.
+        A span is (start, size, count). ``limit`` is the largest number of frames, by default unlimited.
         """
         spans: list[Span] = []
         size_of_text = len(self._text.data)
-        limit = size_of_text if limit is None else limit
-        while limit > 0:
+        remaining = size_of_text if limit is None else limit
+        while remaining > 0:
             size = self._size(offset)
             if size is None or offset + size > size_of_text:
                 return spans, offset, False
             if size == 0:
                 return spans, offset, True
-            count = max(1, min((size_of_text - offset) // size, MAX_CHECKED_BYTES // size, limit))
+            count = max(1, min((size_of_text - offset) // size, MAX_CHECKED_BYTES // size, remaining))
             run = self._count_good(offset, size, count)
             if run:
                 spans.append((offset, size, run))
                 offset += run * size
-                limit -= run
+                remaining -= run
             if run < count and (run == 0 or self._size(offset) == size):
                 return spans, offset, True
         return spans, offset, False
 
     def _size(self, offset: int) -> int | None:
-        """Return the size of the frame at ``offset``. Returns 0 if no frame starts there, None if bytes are missing."""
+        """Return the size of the frame at ``offset``, 0 if no frame starts there, or None if more bytes are needed."""
         text, framing = self._text.data, self.framing
         if not text.startswith(framing.marker, offset):
             mark = text[offset : offset + len(framing.marker)]
@@ -156,11 +167,15 @@ class ByteFramer:
             return None
         if head != self._last_header[0]:
             size = int(framing.sizes(np.frombuffer(head, np.uint8)[None])[0])
-            self._last_header = head, size if framing.header <= size <= framing.max_size else 0
+            is_valid = framing.header <= size <= framing.max_size
+            self._last_header = head, (size if is_valid else 0)
         return self._last_header[1]
 
     def _size_to_tail(self, offset: int) -> int | None:
-        """Return the size of a frame from ``offset`` to its tail: the size of the last frame if a tail is there, too."""
+        """Return the size of a frame from ``offset`` to its tail, 0 if it has none, or None if more bytes are needed.
+
+        The size of the last frame is tried first.
+        """
         text, tail = self._text.data, self.framing.tail
         if self._last_size and text[offset + self._last_size - len(tail) : offset + self._last_size] == tail:
             return self._last_size
@@ -180,17 +195,18 @@ class ByteFramer:
         A good frame has the right marks, size and checksum.
         """
         framing, text = self.framing, self._text.data
+        good = count
         for at, mark in self._marks(size):
-            column = text[offset + at : offset + count * size : size]  # this byte of each frame
-            count -= len(column.lstrip(mark))
-        if framing.sizes is not None and count > 1:  # the size of the first is already known
-            count = _count_leading(framing.sizes(self._frames(offset, size, count)[:, : framing.header]) == size)
-        if framing.check is not None and count:
-            count = _count_leading(framing.check(self._frames(offset, size, count)))
-        return count
+            column = text[offset + at : offset + good * size : size]  # this byte of each frame
+            good -= len(column.lstrip(mark))
+        if framing.sizes is not None and good > 1:  # the size of the first is already known
+            good = _count_leading(framing.sizes(self._frames(offset, size, good)[:, : framing.header]) == size)
+        if framing.check is not None and good:
+            good = _count_leading(framing.check(self._frames(offset, size, good)))
+        return good
 
     def _marks(self, size: int) -> list[tuple[int, bytes]]:
-        """Return (offset, byte) of each byte of the marks of frames of this size."""
+        """Return the offset and value of each byte of marker and tail in frames of this size."""
         if size != self._cached_marks[0]:
             framing = self.framing
             offsets = [*range(len(framing.marker)), *range(size - len(framing.tail), size)]
@@ -203,11 +219,11 @@ class ByteFramer:
         return np.frombuffer(self._text.data, np.uint8, count * size, offset).reshape(count, size)
 
     def _search(self, offset: int, *, at_end: bool) -> tuple[int | None, int]:
-        """Return the first offset from ``offset`` on at which ``lock`` good frames start, or None.
+        """Return the first offset at which ``lock`` good frames start, from ``offset`` on, or None.
 
         Also returns the first offset at which they may still start when more bytes arrive.
         """
-        possible: int | None = None
+        first_possible: int | None = None
         size_of_text = len(self._text.data)
         required = 1 if at_end and self.framing.has_checksum else self.framing.lock
         base = self._text.base
@@ -221,15 +237,15 @@ class ByteFramer:
                 return self._choose_phase(start)
             if broken:
                 self._dead_starts.add(base + start)
-            elif possible is None:
-                possible = start
-        return None, size_of_text if possible is None else possible
+            elif first_possible is None:
+                first_possible = start
+        return None, size_of_text if first_possible is None else first_possible
 
     def _choose_phase(self, start: int) -> tuple[int | None, int]:
-        """Return the start within one frame from ``start`` on at which marks repeat for longest. Returns like `_search`.
+        """Return the offset within one frame from ``start`` on at which marks repeat for longest; results as of `_search`.
 
-        A constant payload may contain the marker in every frame. Without a checksum, only a change of the payload reveals
-        the true start.
+        A constant payload may contain the marker in every frame. Without a checksum, only a change of the payload
+        reveals the true start: until then, the first result is None.
         """
         size = self.framing.size
         if self.framing.has_checksum or size is None:
@@ -374,6 +390,7 @@ class LineFramer:
         return [], self._drop(len(self._text.data))
 
     def _drop(self, count: int) -> list[FramingLoss]:
+        """Remove ``count`` bytes without a line end, and return them as a loss."""
         if not count:
             return []
         last_ns = self._text.arrival(count - 1)

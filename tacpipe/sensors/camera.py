@@ -56,7 +56,7 @@ def pack_settings(settings: Mapping[str, Any]) -> bytes:
 
 
 def unpack_frame(packet: bytes) -> Frame | None:
-    """Return the frame of a packet, None for any other packet."""
+    """Return the frame of a packet, or None for any other packet."""
     if packet[: len(MAGIC) + 1] != MAGIC + FRAME or len(packet) < HEAD.size:
         return None
     _, _, size, number, t_us, t_device_ns = HEAD.unpack_from(packet)
@@ -75,15 +75,15 @@ def unpack_settings(packet: bytes) -> dict[str, Any] | None:
 
 
 def options(data: Chunks) -> list[Options]:
-    """Return a list with the options that a camera's packets contain; the list is empty before the first frame."""
+    """Return a list with the options that a camera's packets report; it is empty before the first frame."""
     packets = data.packets()
     settings = next((values for packet in packets if (values := unpack_settings(packet)) is not None), None)
     frames = (frame for packet in packets if (frame := unpack_frame(packet)) is not None)
     shape = next((shape for frame in frames if (shape := read_shape(frame.content)) is not None), None)
     if shape is None:
         return []
-    stated: dict[str, Any] = {name: settings[name] for name in STATED if name in settings} if settings else {}
-    return [{**shape._asdict(), **stated}]
+    reported: dict[str, Any] = {name: settings[name] for name in STATED if name in settings} if settings else {}
+    return [{**shape._asdict(), **reported}]
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,7 @@ class Camera(Sensor):
         ]
 
     def _is_right(self, packet: bytes) -> bool:
+        """Return whether a packet is a report of settings or a frame of the declared size and format."""
         frame = unpack_frame(packet)
         if frame is None:
             return unpack_settings(packet) is not None

@@ -76,11 +76,11 @@ def _crc(data: Bytes, kind: CrcKind, polynomial: int, bits: int, start: bytes) -
     contributions of all bytes are looked up at once and combined by exclusive or.
     """
     count = data.shape[1]
-    unused = start[count:]  # bytes of the initial value beyond the data
+    excess = start[count:]  # bytes of the initial value beyond the data
     remainder = (
-        int.from_bytes(unused.ljust(len(start), b"\x00"))
+        int.from_bytes(excess.ljust(len(start), b"\x00"))
         if kind is _high_bit_first
-        else int.from_bytes(unused, "little")
+        else int.from_bytes(excess, "little")
     )
     crc = np.full(len(data), remainder, dtype=np.uint32)
     if not count:
@@ -108,7 +108,10 @@ def _contributions(kind: CrcKind, polynomial: int, bits: int, count: int) -> NDA
 
 
 def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return the table (256,) of a CRC with the least significant bit first, and the function that updates the CRC."""
+    """Return the table (256,) of a CRC with the least significant bit first, and the function that appends a zero byte.
+
+    ``bits`` is not used.
+    """
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(polynomial), table >> 1)
@@ -116,7 +119,7 @@ def _low_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step
 
 
 def _high_bit_first(polynomial: int, bits: int) -> tuple[NDArray[np.uint32], Step]:
-    """Return the table (256,) of a CRC with the most significant bit first, and the function that updates the CRC."""
+    """Return the table (256,) of a CRC with the most significant bit first, and the function that appends a zero byte."""
     mask = np.uint32((1 << bits) - 1)
     table = np.arange(256, dtype=np.uint32) << np.uint32(bits - 8)
     for _ in range(8):

@@ -74,13 +74,17 @@ class Clouds(Sensor):
         return [point_files.pack_ply(points[rows], samples.values[1][rows] if self.colour else None) for rows in groups]
 
     def _points(self, content: bytes) -> tuple[Float32s, Bytes | None]:
-        """Return the measured points (point, xyz) in metres, and their colours (point, rgb)."""
+        """Return the points of a cloud (point, xyz) in metres, and their colours (point, rgb) or None.
+
+        Points that were not measured are left out.
+        """
         xyz, colours = _parse(content)
         is_finite = np.isfinite(xyz).all(axis=1)
         scale = np.float32(1.0 if content.startswith(MAGIC) else self.unit_m)
         return xyz[is_finite] * scale, None if colours is None else colours[is_finite]
 
     def _is_valid(self, content: bytes) -> bool:
+        """Return whether a chunk is a cloud, with colours if they are expected."""
         try:
             _, colours = _parse(content)
         except TacpipeError:

@@ -70,7 +70,7 @@ class Contactile(Sensor):
         """
         import pyarrow as pa
 
-        sensors = [(f"sensor{s}", {"sensor": str(s)}) for s in range(1, self.sensors + 1)]
+        sensors = [(f"sensor{number}", {"sensor": str(number)}) for number in range(1, self.sensors + 1)]
         pillars = [
             (f"{name}_pillar{pillar}", {**layout, "taxel": str(pillar)})
             for name, layout in sensors
@@ -101,11 +101,12 @@ class Contactile(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer for frames with a right sum and valid tables, without frames of the last session."""
-        framing = Framing(marker=pts.MARKER, tail=pts.TAIL, max_size=MAX_SIZE, check=pts.are_whole)
+        framing = Framing(marker=pts.MARKER, tail=pts.TAIL, max_size=MAX_SIZE, check=pts.are_valid)
         return FreshFramer(ByteFramer(framing), self._counters, COUNTER, round(JUMP_S * self.rate_hz))
 
     @staticmethod
     def _counters(frames: Bytes) -> Int64s:
+        """Return the hub's counter in each frame (frame,)."""
         counters = np.zeros(len(frames), dtype=np.int64)
         for rows, layout in pts.layouts(frames):
             assert layout is not None  # checked by the framer
@@ -118,7 +119,7 @@ class Contactile(Sensor):
         With ``slip``, frames without slip blocks, which the controller sends before detection starts, are skipped. Raises
         `DeviceError` if the controller has other sensors than the options.
         """
-        parts: list[tuple[Int64s, tuple[AnyArray, ...], NDArray[np.uint8]]] = []
+        decoded_parts: list[tuple[Int64s, tuple[AnyArray, ...], NDArray[np.uint8]]] = []
         for rows, layout in pts.layouts(frames):
             assert layout is not None  # checked by the framer
             if layout.counts != (self.pillars,) * self.sensors:
@@ -129,18 +130,23 @@ class Contactile(Sensor):
             if self.slip and not layout.has_slip:
                 continue
             selected = frames[rows]
-            parts.append((rows, self._values(selected, layout), _gather(selected, layout.offsets(pts.HUB), 12)[:, 0]))
-        if not parts:
+            decoded_parts.append(
+                (rows, self._values(selected, layout), _gather(selected, layout.offsets(pts.HUB), 12)[:, 0])
+            )
+        if not decoded_parts:
             return self._empty_samples()
-        rows = np.concatenate([part[0] for part in parts])
+        rows = np.concatenate([part[0] for part in decoded_parts])
         order = np.argsort(rows, kind="stable")
-        hub = np.concatenate([part[2] for part in parts])[order]
-        values = tuple(np.concatenate(blocks)[order] for blocks in zip(*(part[1] for part in parts), strict=True))
+        hub = np.concatenate([part[2] for part in decoded_parts])[order]
+        values = tuple(
+            np.concatenate(blocks)[order] for blocks in zip(*(part[1] for part in decoded_parts), strict=True)
+        )
         seq = np.ascontiguousarray(hub[:, :4]).view("<u4")[:, 0].astype(np.int64)
         t_us = np.ascontiguousarray(hub[:, 4:]).view("<u8")[:, 0].astype(np.int64)
         return Samples(values, seq=seq, t_device_ns=t_us * 1000, rows=rows[order])
 
     def _empty_samples(self) -> Samples:
+        """Return samples without rows, in blocks of the right types."""
         no_rows = np.zeros(0, dtype=np.int64)
         layout = pts.parse(pts.template(self.sensors, self.pillars, slip=self.slip))
         return Samples(
@@ -151,6 +157,7 @@ class Contactile(Sensor):
         )
 
     def _values(self, frames: Bytes, layout: pts.PtsLayout) -> tuple[AnyArray, ...]:
+        """Return forces (frame, channel), and with ``slip`` also states, friction, totals and grip forces."""
         forces = np.hstack(
             [_floats(_gather(frames, layout.offsets(block), 24)) for block in (pts.PILLARS, pts.SENSORS)]
         )
@@ -203,6 +210,7 @@ class _ContactileController(Device):
     """An emulated controller, which receives lines of text and does not answer."""
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process commands of the host, of which only the rate has an effect. There are no replies."""
         self.heard += data
         while (stop := self.heard.find(b"\n")) >= 0:
             line = bytes(self.heard[:stop])
@@ -213,6 +221,7 @@ class _ContactileController(Device):
 
 
 def _vector_fields(prefix: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:
+    """Return the float32 fields of a vector: x, y and z, with ``layout`` in their metadata."""
     import pyarrow as pa
 
     suffix = unit.replace(" ", "_").lower()

@@ -151,16 +151,18 @@ class ByteBuffer:
         return self._stamps[bisect_right(self._ends, self.base + offset)]
 
     def arrivals(self, offsets: Times | range) -> Times:
-        """Return the arrivals (byte,) in ns of the bytes at ``offsets`` (byte,), which must be ascending and not empty."""
+        """Return the arrivals (byte,) in ns of the bytes at ``offsets`` (byte,), which must be ascending and not empty.
+
+        The offsets are counted from the first byte of the buffer.
+        """
         first = bisect_right(self._ends, self.base + int(offsets[0]))
         last = bisect_right(self._ends, self.base + int(offsets[-1]), first)
         if first == last:  # all in one chunk
             arrivals_ns = np.empty(len(offsets), dtype=np.int64)
             arrivals_ns.fill(self._stamps[first])
             return arrivals_ns
-        if isinstance(offsets, range):
-            offsets = np.arange(offsets.start, offsets.stop, offsets.step)
-        chunks = np.array(self._ends[first:last]).searchsorted(self.base + offsets, side="right")
+        positions = self.base + np.asarray(offsets)
+        chunks = np.array(self._ends[first:last]).searchsorted(positions, side="right")
         return np.array(self._stamps[first : last + 1], dtype=np.int64)[chunks]
 
     def cut(self, count: int) -> None:

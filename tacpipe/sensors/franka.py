@@ -79,10 +79,11 @@ class Franka(Sensor):
             raise UsageError(f"franka: rate_hz is {self.rate_hz:g}; it must be {RATE_HZ:g}, the fixed rate of the arm.")
 
     def fields(self) -> list[pa.Field]:
-        """Return end-effector pose, joint angles, velocities, torques, external torques, external load, modes, errors.
+        """Return the fields of end-effector pose, joints, load, modes and errors, in this order.
 
-        With ``targets``, the target pose follows the load. Floats are converted to float64, as for other arms. The load acts
-        on the stiffness frame and is in the base frame. Each error is one bit, in the order of the interface.
+        Joints have angles, velocities, torques and external torques. With ``targets``, the target pose follows the
+        load. Floats are converted to float64, as for other arms. The load acts on the stiffness frame and is in the
+        base frame. Each error is one bit, in the order of the interface.
         """
         import pyarrow as pa
 
@@ -135,9 +136,9 @@ class Franka(Sensor):
         assert samples.seq is not None
         states = np.zeros(len(samples), STATE)
         states["message_id"] = samples.seq
-        states[MEASURED] = _flat(floats[:, :7])
+        states[MEASURED] = _to_matrices(floats[:, :7])
         if self.targets:
-            states[TARGET] = _flat(floats[:, -7:])
+            states[TARGET] = _to_matrices(floats[:, -7:])
         column = 7
         for name in READ[1:-1]:
             states[name] = floats[:, column : column + FLOATS[name]]
@@ -180,6 +181,7 @@ class _Arm(Device):
     port: int | None = None
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process messages of the host, and return the replies: a connection with the right version starts the stream."""
         self.heard += data
         replies = []
         while (size := message_size(bytes(self.heard))) > 0:
@@ -222,7 +224,7 @@ def _poses(states: NDArray[np.void], name: str) -> Floats:
     return np.hstack([pose[:, :3, 3], kinematics.matrices_to_quaternions(pose[:, :3, :3])])
 
 
-def _flat(poses: Floats) -> Floats:
+def _to_matrices(poses: Floats) -> Floats:
     """Return positions with quaternions (frame, 7) as column-major matrices (frame, 16)."""
     matrices = np.zeros((len(poses), 4, 4))
     matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = (

@@ -58,6 +58,7 @@ class Generic(layout.DescribedSensor):
     baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` if options are invalid or contradict each other; set the wrap of the device's clock."""
         sensor.check_positive("generic", rate_hz=self.rate_hz, baud=self.baud)
         for name in ("marker", "tail", "start", "stop"):
             _bytes(name, getattr(self, name))
@@ -79,7 +80,7 @@ class Generic(layout.DescribedSensor):
             object.__setattr__(self, "device_wrap_ns", wrap_ns)
 
     def _check_names(self) -> None:
-        names = [name for span in self._channels for name, _ in _names(span.number)]
+        names = [name for span in self._channels for name, _ in _channels_of_number(span.number)]
         if repeated := next((name for name in names if names.count(name) > 1), None):
             raise UsageError(f"generic: two channels are named {repeated}; give the numbers other names.")
 
@@ -124,6 +125,7 @@ class Generic(layout.DescribedSensor):
 
     @functools.cached_property
     def _channels(self) -> list[layout.NumberSpan]:
+        """Return the numbers that are channels: without a role, not constant, and not skipped."""
         roles = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
         return [
             span
@@ -141,7 +143,7 @@ class Generic(layout.DescribedSensor):
         return [
             pa.field(name, pa.from_numpy_dtype(span.dtype), metadata=metadata)
             for span in self._channels
-            for name, metadata in _names(span.number)
+            for name, metadata in _channels_of_number(span.number)
         ]
 
     def framer(self) -> Framer:
@@ -200,19 +202,18 @@ class Generic(layout.DescribedSensor):
 
         Frames whose size differs from that of the numbers contain no sample.
         """
-        if frames.shape[1] != self.size:
-            frames, rows = np.zeros((0, self.size), dtype=np.uint8), np.zeros(0, dtype=np.int64)
-        else:
-            rows = None
+        has_samples = frames.shape[1] == self.size
+        data = frames if has_samples else np.zeros((0, self.size), dtype=np.uint8)
+        rows = None if has_samples else np.zeros(0, dtype=np.int64)
         values = tuple(
-            np.hstack([span.read(frames) for span in block]) if len(block) > 1 else block[0].read(frames)
+            np.hstack([span.read(data) for span in block]) if len(block) > 1 else block[0].read(data)
             for block in self._blocks
         )
         seq = t_device_ns = None
         if self.sequence is not None:
-            seq = self._spans[self.sequence.number].read(frames)[:, 0].astype(np.int64)
+            seq = self._spans[self.sequence.number].read(data)[:, 0].astype(np.int64)
         if self.clock is not None:
-            ticks = self._spans[self.clock.number].read(frames)[:, 0]
+            ticks = self._spans[self.clock.number].read(data)[:, 0]
             t_device_ns = layout.device_ns(ticks, self.clock.unit)
         return Samples(values, seq=seq, t_device_ns=t_device_ns, rows=rows)
 
@@ -276,15 +277,19 @@ class Generic(layout.DescribedSensor):
         return layout.Board(streaming=not start, start=start, stop=stop)
 
 
-def _names(number: layout.Number) -> list[tuple[str, dict[str, str]]]:
-    """Return (name, metadata) of each channel of a number."""
+def _channels_of_number(number: layout.Number) -> list[tuple[str, dict[str, str]]]:
+    """Return the name and metadata of each channel of a number, which may be an array with axes."""
     metadata = {"unit": number.unit, "quantity": number.quantity}
     channels: list[tuple[str, dict[str, str]]] = []
     names = [number.name] if number.count == 1 else sensor.numbered_names(number.name, number.count)
     for taxel, name in enumerate(names, start=1):
-        own = metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(taxel)}
+        taxel_metadata = (
+            metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(taxel)}
+        )
         key = "axis" if number.quantity == "tactile" else "component"
-        channels += [(f"{name}_{axis}", {**own, key: axis}) for axis in number.axes] or [(name, own)]
+        channels += [(f"{name}_{axis}", {**taxel_metadata, key: axis}) for axis in number.axes] or [
+            (name, taxel_metadata)
+        ]
     return channels
 
 

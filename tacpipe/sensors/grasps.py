@@ -50,7 +50,7 @@ class GraspRequests(Sensor):
     rate_hz: float = 0.0  # requests per second; 0: irregular
 
     def fields(self) -> list[pa.Field]:
-        """Return the request number, the grasp number, both contact points, and the wrist's rotation row by row."""
+        """Return the fields of request number, grasp number, both contact points, and the wrist's rotation row by row."""
         import pyarrow as pa
 
         def number(name: str) -> pa.Field:
@@ -153,6 +153,7 @@ def _is_cloud(cloud: Any) -> bool:
 
 
 def _are_numbers(row: Any, count: int) -> bool:
+    """Return whether a JSON value is a list of ``count`` finite numbers."""
     return (
         type(row) is list
         and len(row) == count

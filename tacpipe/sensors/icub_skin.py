@@ -56,7 +56,10 @@ class ScanFramer:
         self._last_position = self.size  # position in its scan of the last valid CAN frame
 
     def feed(self, chunks: Chunks) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the scans that are now complete, and the CAN frames of torn scans as losses."""
+        """Return the scans that are now complete, and the CAN frames of torn scans as losses.
+
+        CAN frames of the last, incomplete scan are kept for the next call.
+        """
         self.account.received += len(chunks.data)
         frames, t_ns, losses = self._can_frames(chunks)
         data, stamps = np.vstack([self._data, frames]), np.concatenate([self._t_ns, t_ns])
@@ -65,12 +68,13 @@ class ScanFramer:
         losses += [FramingLoss(int(at_ns), MALFORMED, 0, CAN) for at_ns in stamps[is_invalid]]
         starts, open_at = self._scans(positions, stamps)
         rows_of_scans = (starts[:, None] + np.arange(self.size)).ravel()
-        keep = len(data) if open_at is None else open_at
+        stop = len(data) if open_at is None else open_at
         unassigned = np.ones(len(data), dtype=bool)
         unassigned[rows_of_scans] = unassigned[is_invalid] = False
-        first = 0 if self._has_scans else int(starts[0]) if len(starts) else keep
-        losses += self._torn(unassigned[:keep], positions[:keep], stamps[:keep], first)
-        self._data, self._t_ns = data[keep:], stamps[keep:]
+        first_scan = int(starts[0]) if len(starts) else stop
+        first = 0 if self._has_scans else first_scan
+        losses += self._torn_losses(unassigned[:stop], positions[:stop], stamps[:stop], first)
+        self._data, self._t_ns = data[stop:], stamps[stop:]
         self.account.framed += len(rows_of_scans) * CAN
         self.account.lost += sum(loss.bytes for loss in losses)
         if not len(starts):
@@ -107,12 +111,14 @@ class ScanFramer:
             return starts, None
         follows = np.diff(positions, prepend=-2) == 1
         follows &= np.diff(t_ns, prepend=t_ns[0]) <= self._pause_ns
-        breaks = np.append(np.flatnonzero(~follows), len(positions))
-        length = breaks[np.searchsorted(breaks, starts, side="right")] - starts
-        open_at = int(starts[-1]) if starts[-1] + length[-1] == len(positions) and length[-1] < self.size else None
-        return starts[length >= self.size], open_at
+        run_ends = np.append(np.flatnonzero(~follows), len(positions))
+        length = run_ends[np.searchsorted(run_ends, starts, side="right")] - starts
+        incomplete_start = (
+            int(starts[-1]) if starts[-1] + length[-1] == len(positions) and length[-1] < self.size else None
+        )
+        return starts[length >= self.size], incomplete_start
 
-    def _torn(self, unassigned: Bools, positions: Int64s, t_ns: Times, first: int) -> list[FramingLoss]:
+    def _torn_losses(self, unassigned: Bools, positions: Int64s, t_ns: Times, first: int) -> list[FramingLoss]:
         """Return a loss for each run of CAN frames outside of complete scans, with the number of scans in it.
 
         Rows before ``first`` belong to the scan during which recording started.
@@ -132,9 +138,10 @@ class ScanFramer:
         ]
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the CAN frames of an incomplete scan as a loss."""
-        unassigned, first = np.ones(len(self._data), dtype=bool), 0 if self._has_scans else len(self._data)
-        losses = self._torn(unassigned, self._positions(self._data), self._t_ns, first)
+        """Return no scans, and the CAN frames of an incomplete scan as a loss."""
+        unassigned = np.ones(len(self._data), dtype=bool)
+        first = 0 if self._has_scans else len(self._data)
+        losses = self._torn_losses(unassigned, self._positions(self._data), self._t_ns, first)
         self.account.lost += len(self._data) * CAN
         self._data, self._t_ns = self._data[:0], self._t_ns[:0]
         return [], losses
@@ -256,7 +263,7 @@ class IcubSkin(Sensor):
         return scans.reshape(len(taxels), 2 * CAN * len(self.triangles))
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Configure board and triangles, and start the stream."""
+        """Yield the messages that configure board and triangles and start the stream."""
         if self.old:
             yield self._command(OLD_TIMING, 1, 1, 1, 0, OFFSET >> 8, 0, 0, pause_s=0.01)
             yield self._command(OLD_TRIANGLES, SHIFT, 0x22, NO_LOAD, 0, 0xFF, 0xFF, 0x0A)
@@ -286,6 +293,7 @@ class _Board(Device):
         self.sensor = sensor
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process CAN frames of the host, which set the rate and start or stop the stream. There are no replies."""
         self.heard += data
         while len(self.heard) >= CAN:
             message = bytes(self.heard[:CAN])

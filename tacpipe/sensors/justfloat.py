@@ -126,6 +126,7 @@ class _Bridge(Device):
     model: str = ""
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process lines of the host: start and stop the stream, or return the reply with the model."""
         self.heard += data
         replies = []
         while (stop := self.heard.find(b"\n")) >= 0:

@@ -110,7 +110,8 @@ class KukaRsi(Sensor):
         assert samples.seq is not None
         blocks = [_to_wire(name, block).tolist() for name, block in zip(self.outputs, samples.values, strict=True)]
         return [
-            _text(self.outputs, [block[row] for block in blocks], ipoc) for row, ipoc in enumerate(samples.seq.tolist())
+            _to_xml(self.outputs, [block[row] for block in blocks], ipoc)
+            for row, ipoc in enumerate(samples.seq.tolist())
         ]
 
     def answer(self, chunk: bytes) -> bytes:
@@ -131,11 +132,11 @@ def _numbers(outputs: tuple[str, ...], packet: bytes) -> tuple[float, ...] | Non
     try:
         root = ElementTree.fromstring(packet)
         ipoc = int(root.findtext("IPOC", ""))
-        numbers = [ipoc, *(float(text) for name in outputs for text in _texts(root, name))]
+        values = [ipoc, *(float(text) for name in outputs for text in _texts(root, name))]
     except (ElementTree.ParseError, ValueError):
         return None
-    is_valid = len(numbers) == 1 + sum(map(_width, outputs)) and 0 <= ipoc < 1 << 32
-    return tuple(numbers) if root.tag == "Rob" and is_valid and all(map(math.isfinite, numbers)) else None
+    is_valid = len(values) == 1 + sum(map(_width, outputs)) and 0 <= ipoc < 1 << 32
+    return tuple(values) if root.tag == "Rob" and is_valid and all(map(math.isfinite, values)) else None
 
 
 @functools.lru_cache(maxsize=CACHED_BATCHES)
@@ -190,6 +191,7 @@ def _texts(root: ElementTree.Element, name: str) -> list[str]:
 
 
 def _fields(name: str) -> list[pa.Field]:
+    """Return the fields of an output of the controller."""
     from tacpipe.channels import schema
 
     if name == "RIst":
@@ -219,7 +221,8 @@ def _to_wire(name: str, columns: Floats) -> Floats:
     return np.degrees(columns) if name in ANGLES else columns
 
 
-def _text(outputs: Sequence[str], values: Sequence[Sequence[float]], ipoc: int) -> bytes:
+def _to_xml(outputs: Sequence[str], values: Sequence[Sequence[float]], ipoc: int) -> bytes:
+    """Return the XML message with ``values`` of the outputs and the clock ``ipoc`` in ms."""
     root = ElementTree.Element("Rob", Type="KUKA")
     for name, numbers in zip(outputs, values, strict=True):
         tag, _, attribute = name.partition(".")

@@ -141,10 +141,11 @@ class NumberSpan:
 def number_spans(numbers: Iterable[Number], start: int, order: Order) -> dict[str, NumberSpan]:
     """Return the span of each number by name. The first starts at byte ``start``.
 
-    Raises `UsageError` for an invalid or repeated name, an invalid count or axes, or a constant that the type cannot
-    represent.
+    ``order`` is the byte order of numbers that have none. Raises `UsageError` for an invalid or repeated name, an
+    invalid count or axes, or a constant that the type cannot represent.
     """
     by_name: dict[str, NumberSpan] = {}
+    next_start = start
     for number in numbers:
         if not NAME.fullmatch(number.name):
             _refuse(f"{number.name!r} is not a valid name; use lower-case letters, digits and _")
@@ -154,7 +155,7 @@ def number_spans(numbers: Iterable[Number], start: int, order: Order) -> dict[st
             _refuse(f"the number {number.name} has count = {number.count}; it must be between 1 and 4096")
         if len(set(number.axes)) < len(number.axes) or not (number.axes == "" or number.axes.isalnum()):
             _refuse(f'the number {number.name} has axes = "{number.axes}"; it must be unique letters, such as "xyz"')
-        span = NumberSpan(number, start, number.order or order)
+        span = NumberSpan(number, next_start, number.order or order)
         if number.equals is not None:
             smallest = 0 if number.type[0] != "i" else -span.value_count // 2
             if number.type[0] == "f":
@@ -164,7 +165,7 @@ def number_spans(numbers: Iterable[Number], start: int, order: Order) -> dict[st
                     f"the number {number.name} has equals = {number.equals}, which its type {number.type} cannot represent"
                 )
         by_name[number.name] = span
-        start = span.stop
+        next_start = span.stop
     return by_name
 
 
@@ -198,7 +199,8 @@ def summed_bytes(total: Sum, span: NumberSpan, size: int) -> slice:
             f"use u{8 * width}"
         )
     begin = total.begin + size if total.begin < 0 else total.begin
-    end = span.start if total.end is None else total.end + size if total.end < 0 else total.end
+    end = span.start if total.end is None else total.end
+    end += size if end < 0 else 0
     if not 0 <= begin < end <= size:
         _refuse(
             f"the summed range is {begin} to {end} (exclusive) in a frame of {size} bytes; "
@@ -276,7 +278,7 @@ class Board(Device):
     stop: bytes = b""
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Process commands of the host. There are no replies."""
+        """Start or stop the stream, as the last command of the host says. There are no replies."""
         self.heard += data
         started = self.heard.rfind(self.start) if self.start else -1
         stopped = self.heard.rfind(self.stop) if self.stop else -1

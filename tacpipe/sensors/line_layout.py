@@ -126,7 +126,10 @@ def layout_cells(columns: tuple[LineColumn, ...]) -> tuple[LineCell, ...]:
 
 
 def _expand(column: LineColumn) -> Iterator[LineCell]:
-    """Yield the cells of a column. The last braces vary fastest."""
+    """Yield the cells of a column; the last braces vary fastest.
+
+    Raises `UsageError` if the label has other braces than the name.
+    """
     braces = _braces(column.name)
     if _braces(column.label) not in ([], braces):
         _refuse(f"the label {column.label!r} must contain the braces of the name {column.name!r}, or none")
@@ -152,7 +155,7 @@ class _Braces:
 
 
 def _braces(pattern: str) -> list[_Braces]:
-    """Return the braces of a pattern."""
+    """Return the braces of a pattern with their values. Raises `UsageError` for a descending or too long range."""
     braces = []
     for first, last, words in BRACES.findall(pattern):
         if words:
@@ -234,8 +237,8 @@ class Parser:
         """
         return not line or bool(self.comments and line.startswith(self.comments) and LETTER.search(line))
 
-    def table(self, lines: Sequence[bytes]) -> LineNumbers | None:
-        """Return the numbers of lines, or None if a line is invalid."""
+    def parse_table(self, lines: Sequence[bytes]) -> LineNumbers | None:
+        """Return the numbers of lines by type, or None if a line is invalid."""
         bodies = self._strip_affixes(lines)
         if bodies is None:
             return None
@@ -254,7 +257,7 @@ class Parser:
 
     @cached_property
     def _channels_by_type(self) -> dict[str, list[int]]:
-        """The positions among the channels, by type."""
+        """The positions among the channels of the numbers of each type."""
         types = [self.cells[position].type for position in self._channels]
         return {
             kind: [row for row, kind_of_cell in enumerate(types) if kind_of_cell == kind]
@@ -271,19 +274,15 @@ class Parser:
 
     def _strip_affixes(self, lines: Sequence[bytes]) -> list[bytes] | None:
         """Return the lines without checksum, prefix and suffix, or None if a line lacks one or its checksum is wrong."""
-        if self.sum is not None:
-            bodies = _strip_checksums(lines, self.sum)
-            if bodies is None:
-                return None
-            lines = bodies
-        if not (self.prefix or self.suffix):
-            return list(lines)
+        bodies = list(lines) if self.sum is None else _strip_checksums(lines, self.sum)
+        if bodies is None or not (self.prefix or self.suffix):
+            return bodies
         smallest, stop = len(self.prefix) + len(self.suffix), -len(self.suffix) or None
         if not all(
-            len(line) >= smallest and line.startswith(self.prefix) and line.endswith(self.suffix) for line in lines
+            len(body) >= smallest and body.startswith(self.prefix) and body.endswith(self.suffix) for body in bodies
         ):
             return None
-        return [line[len(self.prefix) : stop] for line in lines]
+        return [body[len(self.prefix) : stop] for body in bodies]
 
     def _parse_batch(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
         """Return the numbers by type, or None if a line is invalid or needs `_parse_one_by_one`."""
@@ -311,11 +310,15 @@ class Parser:
     def _cast(
         self, texts: pa.Array, absent: Bools | None, kind: str, positions: Sequence[int], count: int
     ) -> AnyArray | None:
-        """Return the numbers (line, cell) of one type from texts (line × cell), with NaN for ``absent`` ones."""
-        is_single_type = len(positions) == len(self._channels)
-        if not is_single_type:
-            texts = number_texts.select(texts, _cell_indices(count, len(self._channels), positions))
-        numbers = number_texts.cast(texts, _parsed_type(kind))
+        """Return the numbers (line, cell) of the channels at ``positions``, or None if a text is not a ``kind``.
+
+        ``texts`` are those of all channels (line × channel). Those that are ``absent`` become NaN, which only floats
+        can be.
+        """
+        texts_of_type = texts
+        if len(positions) < len(self._channels):
+            texts_of_type = number_texts.select(texts, _cell_indices(count, len(self._channels), positions))
+        numbers = number_texts.cast(texts_of_type, _parsed_type(kind))
         if numbers is None:
             return None
         numbers = numbers.reshape(count, len(positions))
@@ -325,23 +328,24 @@ class Parser:
         return np.where(is_missing, np.nan, numbers) if kind[0] == "f" else None
 
     def _parse_one_by_one(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
+        """Return the numbers by type like `_parse_batch`, for any valid lines, or None if a line is invalid."""
         rows = []
         for line in lines:
             row = self._parse_line(line)
             if row is None:
                 return None
             rows.append(row)
-        try:
-            return {
-                kind: np.array([[row[column] for column in columns] for row in rows], dtype=_parsed_type(kind)).reshape(
-                    -1, len(columns)
-                )
-                for kind, columns in self._channels_by_type.items()
-            }
-        except OverflowError:
-            return None
+        numbers = {}
+        for kind, columns in self._channels_by_type.items():
+            try:
+                selected = np.array([[row[column] for column in columns] for row in rows], dtype=_parsed_type(kind))
+            except OverflowError:
+                return None
+            numbers[kind] = selected.reshape(-1, len(columns))
+        return numbers
 
     def _parse_line(self, line: bytes) -> list[float | int] | None:
+        """Return the numbers of the channels in a line, or None if it is invalid."""
         words = [word.strip(b" \t") for word in line.split(self.separator)] if self.separator else line.split()
         if len(words) != len(self.cells):
             return None
@@ -391,7 +395,7 @@ def _parsed_type(kind: str) -> np.dtype[np.generic]:
 
 
 def _cast_checked(numbers: AnyArray, kind: str) -> AnyArray | None:
-    """Convert numbers (line, cell) to their type. Returns None if one is out of range. NaN means a missing value."""
+    """Return numbers (line, cell) in their type, or None if one is out of range. NaN is a missing value."""
     target = dtype(kind)
     if target.kind == "f":
         out_of_range = bool((np.abs(numbers) > np.finfo(target).max).any())  # also True for infinity
@@ -426,7 +430,7 @@ def line_sums(texts: Sequence[bytes], total: LineSum) -> AnyArray:
     totals = np.zeros(len(texts), dtype=np.int64)
     rows = sorted(range(len(texts)), key=lambda row: len(texts[row]))
     for size, group in groupby(rows, key=lambda row: len(texts[row])):
-        same_size = list(group)
-        data = np.frombuffer(b"".join(texts[row] for row in same_size), np.uint8).reshape(len(same_size), size)
-        totals[same_size] = layout.SUMS[total.kind][0](data).astype(np.int64)
+        rows_of_size = list(group)
+        data = np.frombuffer(b"".join(texts[row] for row in rows_of_size), np.uint8).reshape(len(rows_of_size), size)
+        totals[rows_of_size] = layout.SUMS[total.kind][0](data).astype(np.int64)
     return totals

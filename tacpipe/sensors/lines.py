@@ -74,6 +74,7 @@ class Lines(DescribedSensor):
     baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` if options are invalid or contradict each other."""
         sensor.check_positive("lines", rate_hz=self.rate_hz, baud=self.baud)
         if not self.separator.isascii() or len(self.separator.strip()) > 1 or not self.separator:
             _refuse(f"separator is {self.separator!r}; it must be one character; a space means spaces or tabs")
@@ -93,7 +94,7 @@ class Lines(DescribedSensor):
         self._check_roles()
 
     def _check_roles(self) -> None:
-        """Raise `UsageError` unless sequence and clock each have their own column of a suitable type."""
+        """Raise `UsageError` unless sequence and clock have a suitable column each. Set the clock's wrap."""
         names = [role.column for role in (self.sequence, self.clock) if role is not None]
         for role, option in (("sequence", self.sequence), ("clock", self.clock)):
             if option is None:
@@ -154,6 +155,7 @@ class Lines(DescribedSensor):
 
     @functools.cached_property
     def _parser(self) -> Parser:
+        """The parser for the lines that the options describe."""
         return Parser(
             self._cells,
             self.separator.strip(" ").encode(),
@@ -166,11 +168,10 @@ class Lines(DescribedSensor):
         )
 
     def _counter_option(self) -> tuple[Counter, int] | None:
-        return (
-            None
-            if self.sequence is None
-            else (self.sequence, _value_count(self._cells_by_name[self.sequence.column][1]))
-        )
+        """Return the option ``sequence`` and the number of values of its type, or None if there is no such option."""
+        if self.sequence is None:
+            return None
+        return self.sequence, _value_count(self._cells_by_name[self.sequence.column][1])
 
     def fields(self) -> list[pa.Field]:
         """Return one field per channel, in the order of the columns, with unit, quantity, taxel and axis."""
@@ -232,6 +233,7 @@ class Lines(DescribedSensor):
         return lines if self.sum is None else _append_sums(lines, self.sum)
 
     def _ticks(self, cell: LineCell, t_device_ns: AnyArray) -> AnyArray:
+        """Return device times in ns as numbers of the clock's unit, which wrap like the clock."""
         assert self.clock is not None
         unit_ns = layout.UNITS_NS[self.clock.unit]
         if cell.kind.kind == "f":
@@ -240,6 +242,7 @@ class Lines(DescribedSensor):
         return np.asarray(ticks % (self.device_wrap_ns // unit_ns) if self.device_wrap_ns else ticks)
 
     def _format_column(self, cell: LineCell, column: AnyArray) -> list[str]:
+        """Return the texts of a column's numbers, with label, decimal mark and missing values as declared."""
         words = [str(value) for value in (column.astype(cell.kind) if cell.kind.kind == "f" else column)]
         if cell.kind.kind == "f":
             words = [word.replace(".", self.decimal) for word in words]
@@ -264,16 +267,17 @@ class Lines(DescribedSensor):
 
 @functools.lru_cache(maxsize=CACHED)
 def _parse(parser: Parser, lines: tuple[bytes, ...]) -> ParsedBatch | None:
-    """Return the parsed lines, or None if one is not a frame."""
+    """Return the parsed lines with the indices of those that are samples (None: all), or None if a line is invalid."""
     if all(lines) and not parser.comments:
-        table = parser.table(lines)
+        table = parser.parse_table(lines)
         return None if table is None else (None, table)
     rows = [row for row, line in enumerate(lines) if not parser.is_comment(line)]
-    table = parser.table([lines[row] for row in rows])
+    table = parser.parse_table([lines[row] for row in rows])
     return None if table is None else (np.array(rows, dtype=np.int64), table)
 
 
 def _append_sums(lines: Sequence[bytes], total: LineSum) -> list[bytes]:
+    """Return lines with their checksum appended."""
     mark, begin = total.mark.encode(), total.begin.encode()
     end = mark if total.mark_summed else b""
     totals = line_sums([line[len(begin) :] + end for line in lines], total).tolist()

@@ -45,7 +45,7 @@ def guess_options(data: Chunks) -> list[Options]:
     if len(texts) < MIN_LINES:
         return []
     options: dict[str, OptionValue] = {}
-    total, bodies = _sum(texts)
+    total, bodies = _guess_sum(texts)
     layout_and_cells = _split_cells(bodies)
     if layout_and_cells is None:
         return []
@@ -60,8 +60,8 @@ def guess_options(data: Chunks) -> list[Options]:
         return []
     names = _names([line.lstrip("#/%; ") for line in lines], separator, labels, len(words[0]), prefix, suffix)
     rate_hz = _rate_hz(t_ns)
-    sequence = _counter(numbers, is_integer)
-    clock = _clock(numbers, is_integer, t_ns, sequence)
+    sequence = _find_counter(numbers, is_integer)
+    clock = _find_clock(numbers, is_integer, t_ns, sequence)
     columns = _columns(names, labels, numbers, is_integer, sequence, clock)
     options |= {"rate_hz": rate_hz, "columns": columns}
     column_names = [column["name"] for column in columns] if names else None
@@ -98,8 +98,11 @@ def _lines(data: Chunks) -> tuple[list[str], Times]:
     return lines, buffer.arrivals(ends) if len(ends) else np.zeros(0, dtype=np.int64)
 
 
-def _sum(lines: Sequence[str]) -> tuple[dict[str, str | bool] | None, list[str]]:
-    """Return the options of the checksum at the end of the lines, or None, and the lines without it."""
+def _guess_sum(lines: Sequence[str]) -> tuple[dict[str, str | bool] | None, list[str]]:
+    """Return the options of the checksum at the end of the lines, or None, and the lines without it.
+
+    Lines without the mark of the checksum are left out.
+    """
     min_count = max(MIN_SHARE * len(lines), MIN_LINES)
     marks = ["*"] if sum(bool(CHECKSUM.search(line)) for line in lines) >= min_count else [",", ";", "\t", " "]
     for mark in marks:
@@ -114,6 +117,10 @@ def _sum(lines: Sequence[str]) -> tuple[dict[str, str | bool] | None, list[str]]
 
 
 def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) -> dict[str, str | bool] | None:
+    """Return the options with which nearly all declared checksums match, or None if there are none.
+
+    ``parts`` are (body, mark, checksum) of each line.
+    """
     base = 16 if digits == "hex" else 10
     words = [word.strip() for _, _, word in parts]
     try:
@@ -142,9 +149,10 @@ def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) 
 
 
 def _split_cells(lines: Sequence[str]) -> tuple[str, str, str, str, list[list[str]], Int64s] | None:
-    """Return prefix, separator, suffix, decimal mark, and the cells and indices of the lines with the most common layout.
+    """Return the layout that most lines have, and the cells of these lines, or None if no separator fits most lines.
 
-    Returns None if no separator fits most lines.
+    The layout is prefix, separator, suffix and decimal mark; cells are (line, cell), followed by the indices of the
+    lines.
     """
     prefix = _common_prefix(lines)
     bodies = [line.removeprefix(prefix) for line in lines]
@@ -180,25 +188,32 @@ def _common_prefix(lines: Sequence[str]) -> str:
 
 def _is_row(words: Sequence[str], decimal: str) -> bool:
     """Return whether every cell is a number or a missing value, with or without label, and at least one is a number."""
-    words_of_row = [(match[2] if (match := LABEL.fullmatch(word)) else word) for word in words]
-    numbers = [bool(NUMBER.fullmatch(word.replace(decimal, "."))) for word in words_of_row]
+    words_without_labels = [(match[2] if (match := LABEL.fullmatch(word)) else word) for word in words]
+    numbers = [bool(NUMBER.fullmatch(word.replace(decimal, "."))) for word in words_without_labels]
     return any(numbers) and all(
-        is_number or word in MISSING for is_number, word in zip(numbers, words_of_row, strict=True)
+        is_number or word in MISSING for is_number, word in zip(numbers, words_without_labels, strict=True)
     )
 
 
 def _labels(cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]] | None]:
-    """Return the label of each cell, or "", and the cells without labels, or None if too few lines have the labels."""
+    """Return the label of each cell, or "", and the cells without labels.
+
+    The cells are None if too few lines have the labels of the first.
+    """
     labels = [match[1] if (match := LABEL.fullmatch(word)) else "" for word in cells[0]]
     if not any(labels):
         return labels, [list(words) for words in cells]
     labelled = [words for words in cells if all(map(str.startswith, words, labels))]
     stripped = [[word[len(label) :].strip() for word, label in zip(words, labels, strict=True)] for words in labelled]
-    return [label.rstrip() for label in labels], stripped if len(labelled) >= MIN_SHARE * len(cells) else None
+    has_labels = len(labelled) >= MIN_SHARE * len(cells)
+    return [label.rstrip() for label in labels], stripped if has_labels else None
 
 
 def _numbers(words: Sequence[Sequence[str]], decimal: str, missing: Sequence[str]) -> tuple[Floats | None, Bools]:
-    """Return the cells as numbers (line, cell), NaN if missing, and a mask (cell,) of those that are always integers."""
+    """Return the cells as numbers (line, cell), NaN if missing, and a mask (cell,) of those that are always integers.
+
+    The numbers are None if a cell is not a number.
+    """
     plain = [["nan" if word in missing else word.replace(decimal, ".") for word in row] for row in words]
     try:
         numbers = np.array(plain, dtype=np.float64)
@@ -233,7 +248,10 @@ def _columns(
     sequence: int | None,
     clock: tuple[int, str] | None,
 ) -> list[dict[str, str]]:
-    """Return the columns. Adjacent columns of one type without names become one array."""
+    """Return the option ``columns``. Adjacent columns of one type without names become one array.
+
+    ``sequence`` is the index of the counter, ``clock`` the index and unit of the clock, each None if there is none.
+    """
     options: list[dict[str, str]] = []
     taxels = 0
     for column in range(len(is_integer)):
@@ -267,6 +285,7 @@ def _type(numbers: Floats, *, is_integer: bool, has_role: bool) -> str:
 
 
 def _rate_hz(t_ns: Times) -> float:
+    """Return the rate of the lines in Hz, rounded to `RATE_DIGITS`, or 100 if they all arrived at once."""
     span_ns = int(t_ns[-1] - t_ns[0])
     if span_ns <= 0:
         return 100.0
@@ -278,7 +297,7 @@ def _step(numbers: Floats) -> int:
     return int(Counter(np.diff(numbers).astype(np.int64).tolist()).most_common(1)[0][0])
 
 
-def _counter(numbers: Floats, is_integer: Bools) -> int | None:
+def _find_counter(numbers: Floats, is_integer: Bools) -> int | None:
     """Return the first column that increases by 1 with nearly every line, or None."""
     for column in np.flatnonzero(is_integer).tolist():
         steps = np.diff(numbers[:, column])
@@ -287,8 +306,8 @@ def _counter(numbers: Floats, is_integer: Bools) -> int | None:
     return None
 
 
-def _clock(numbers: Floats, is_integer: Bools, t_ns: Times, sequence: int | None) -> tuple[int, str] | None:
-    """Return the column that increases with time, and its unit, or None."""
+def _find_clock(numbers: Floats, is_integer: Bools, t_ns: Times, sequence: int | None) -> tuple[int, str] | None:
+    """Return the index and unit of the first column that increases with time, or None."""
     span_ns = float(t_ns[-1] - t_ns[0])
     for column in range(numbers.shape[1]):
         values = numbers[:, column]

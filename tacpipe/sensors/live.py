@@ -108,12 +108,12 @@ def latency_values(*in_json: str) -> tuple[Value, ...]:
     values = []
     for name, meaning in LATENCIES.items():
         is_time = name.endswith("_ms")
-        json = ("number" if is_time else "integer") if name in in_json else ""
+        json_type = "number" if is_time else "integer"
         values.append(
             Value(
                 name,
                 meaning,
-                json,
+                json_type if name in in_json else "",
                 digits=4 if is_time else None,
                 streams=(LATENCY,),
                 unit="ms" if is_time else "1",
@@ -150,7 +150,7 @@ COMMON = Declaration("", latency_values())  # the stream that every session reco
 
 
 def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:
-    """Join arrays (row, column) to one block per run of equal types. ``values`` are (type, array) pairs."""
+    """Join arrays (row, column) to one block per run of equal types. ``values`` are pairs of type and array."""
     return tuple(
         np.hstack([array.astype(kind) for _, array in run])
         for kind, run in itertools.groupby(values, key=lambda typed: typed[0])
@@ -187,6 +187,7 @@ class Live(Sensor):
 
     @functools.cached_property
     def _declaration(self) -> Declaration:
+        """The declared messages of the task. Raises `UsageError` if they do not include the output."""
         live = registry.load_task(self.task).live if self.task else None
         declaration: Declaration = COMMON if live is None else live.declaration
         if self.output not in declaration.streams:
@@ -229,6 +230,7 @@ class Live(Sensor):
         return PacketFramer([self.size], self._are_valid)
 
     def _are_valid(self, packets: Bytes) -> Bools:
+        """Return a mask (packet,) of the packets with the head of this output."""
         heads = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)[:, 0]
         is_valid: Bools = (
             (heads["magic"] == MAGIC)

@@ -50,6 +50,7 @@ class Lsl(Sensor):
     rate_hz: float = 0.0  # samples per second; 0: irregular
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for invalid or repeated channel names and for a negative rate."""
         names = [channel.name for channel in self.channels]
         for name in names:
             if lsl.identifiers([name]) != [name] or name in RESERVED or names.count(name) > 1:
@@ -112,7 +113,10 @@ class Lsl(Sensor):
         return None
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
-        """Return the samples in packets: channels, clock corrections, and timestamps as sent."""
+        """Return the samples in packets: channels, clock corrections, and timestamps as sent.
+
+        Packets without samples are skipped.
+        """
         unpacked = [(row, self._unpack(frame)) for row, frame in enumerate(frames)]
         parts = [(row, packet) for row, packet in unpacked if packet is not None]
         counts = [len(block[1]) for _, block in parts]
@@ -134,14 +138,14 @@ class Lsl(Sensor):
         corrections = samples.values[-1][:, -1].tolist()
         stamps: Times = samples.t_device_ns
         return [
-            packet(
+            pack_samples(
                 samples.values[0][row : row + 1, : len(self.channels)], stamps[row : row + 1] / 1e9, corrections[row]
             )
             for row in range(len(samples))
         ]
 
 
-def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
+def pack_samples(values: AnyArray, stamps: Floats, correction: float) -> bytes:
     """Return a packet of samples (sample, channel) with timestamps (sample,) in s. Values of type object are texts."""
     is_text = values.dtype.kind == "O"
     head = HEAD.pack(TEXTS if is_text else NUMBERS, correction, len(stamps)) + stamps.astype("<f8").tobytes()
@@ -174,6 +178,7 @@ def _parse_description(data: bytes) -> lsl.LslDescription | None:
 
 
 def _texts(data: bytes, count: int, channels: int) -> AnyArray | None:
+    """Return the texts (sample, channel) in a packet, or None if it is invalid."""
     try:
         rows = json.loads(data)
     except (ValueError, RecursionError):
@@ -188,6 +193,7 @@ def _texts(data: bytes, count: int, channels: int) -> AnyArray | None:
 
 
 def _is_encodable(word: str) -> bool:
+    """Return whether a text can be encoded as UTF-8."""
     try:
         word.encode()
     except UnicodeEncodeError:

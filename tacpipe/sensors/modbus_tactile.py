@@ -130,6 +130,7 @@ class _Module(Device):
     requests: int = 0
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Return the replies to requests with the right checksum; other bytes are skipped."""
         self.heard += data
         replies = []
         while len(self.heard) >= HEADER:
@@ -150,7 +151,7 @@ class _Module(Device):
         return replies
 
     def _answer(self, function: int, data: bytes) -> bytes | None:
-        """Return function and data of a reply, or None for a request for taxels, which `polled` counts."""
+        """Return function and data of a reply, or None for a request of taxels, which only increases ``requests``."""
         if function == PRESSURES:
             self.requests += 1
             return None

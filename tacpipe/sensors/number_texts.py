@@ -59,10 +59,11 @@ def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Arra
     if len(marks) != len(lines) * width or (data[marks[width - 1 :: width]] != NEWLINE).any():
         return None
     ends = marks - np.arange(len(marks))  # ends of cells in the text without separators
-    return _texts(text.translate(None, separator + b"\n"), np.concatenate([[0], ends]))
+    return _slice(text.translate(None, separator + b"\n"), np.concatenate([[0], ends]))
 
 
 def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
+    """Return the cells of a text whose cells are separated by spaces or tabs, as `cells` does."""
     data = np.frombuffer(text, np.uint8)
     spaces = np.flatnonzero(data <= SPACES[0])
     without_spaces = text.translate(None, SPACES)
@@ -72,7 +73,7 @@ def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
     last = np.flatnonzero(ends != np.concatenate([[0], ends[:-1]]))
     if len(last) != count * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
         return None
-    return _texts(without_spaces, np.concatenate([[0], ends[last]]))
+    return _slice(without_spaces, np.concatenate([[0], ends[last]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,7 @@ class Pattern:
         edges = np.empty((len(texts), len(self.before), 2), dtype=np.int64)  # (text, number, start and end)
         edges[:, :, 0] = mark_offsets[:, self.before] + 1
         edges[:, :, 1] = mark_offsets[:, self.before + 1]
-        pieces = _texts(text, np.concatenate([[0], edges.ravel(), [len(text)]]))
+        pieces = _slice(text, np.concatenate([[0], edges.ravel(), [len(text)]]))
         if pieces is None:
             return None
         between, numbers = (select_range(pieces, range(first, len(pieces), 2)) for first in (0, 1))
@@ -127,8 +128,8 @@ def _mark_offsets(text: bytes) -> Int64s:
     return np.flatnonzero((data == ord('"')) | (data == ord("<")) | (data == ord(">")))
 
 
-def _texts(text: bytes, edges: Int64s) -> pa.Array | None:
-    """Return the parts of a text between ``edges``, or None if it is too long for 32-bit offsets."""
+def _slice(text: bytes, edges: Int64s) -> pa.Array | None:
+    """Return the parts of a text between ``edges`` (part + 1,), or None if it is too long for 32-bit offsets."""
     import pyarrow as pa
 
     if len(text) > MAX_BYTES:

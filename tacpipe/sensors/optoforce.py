@@ -42,6 +42,7 @@ class OptoForce(Sensor):
     baud: int = 1_000_000  # baud rate of the DAQ
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` if an option has a value that the DAQ does not support."""
         for name, value, allowed in (
             ("axes", self.axes, LENGTHS),
             ("rate_hz", self.rate_hz, SPEEDS),
@@ -116,6 +117,7 @@ class _Daq(Device):
     """An emulated DAQ: it streams at the rate that was set last, and not after a stop."""
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process configurations of the host, which set the rate or stop the stream. There are no replies."""
         self.heard += data
         while (start := self.heard.find(CONFIGURE)) >= 0 and len(self.heard) >= start + 9:
             message = bytes(self.heard[start : start + 9])

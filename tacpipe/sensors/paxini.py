@@ -103,23 +103,20 @@ class RegisterBoard(Device):
         return replies
 
     def _answer(self, function: int, register: int, length: int, data: bytes) -> list[bytes]:
+        """Return the replies to one message: to a read the content, and to a write the result.
+
+        Some writes have effects.
+        """
         if function == READ_FUNCTION:
-            content = next(
-                (
-                    memory[register - base : register - base + length]
-                    for base, memory in self.memory.items()
-                    if base <= register < base + len(memory)
-                ),
-                b"",
-            )
+            content = b""
+            for base, memory in self.memory.items():
+                if base <= register < base + len(memory):
+                    content = memory[register - base : register - base + length]
             return [message(function, register, content.ljust(length, b"\x00"), REPLY)]
         if (function, register) == (WRITE_FUNCTION, PUSHING):
             self.streaming = data == b"\x01"
-            return (
-                [with_sum(PUSH + pack_uint16(1) + b"\x00")]
-                if self.streaming
-                else [message(function, register, b"\x00", REPLY)]
-            )
+            if self.streaming:
+                return [with_sum(PUSH + pack_uint16(1) + b"\x00")]
         if (function, register) == (WRITE_FUNCTION, RESET):
             self.streaming = False
             return []
@@ -165,6 +162,7 @@ class Paxini(Sensor):
     baud: int = 921_600  # baud rate of the board
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for unknown or unordered modules, and for variants that do not match them."""
         for module in self.modules:
             sensor.check_choice("paxini", "modules", module, SLOTS)
         for variant in self.variants:
@@ -332,9 +330,10 @@ def _reply_finder(function: int, register: int) -> Callable[[bytes], int | tuple
 
 
 def find_push_reply(received: bytes) -> int | tuple[int, int]:
-    """Find the reply to the start command: a frame without forces, or a frame with forces, which is not consumed.
+    """Return start and stop of the reply to the start command in received bytes, or 0 if there is none yet.
 
-    Raises `DeviceError` if the reply reports an error.
+    The reply is a frame without forces. A frame with forces also shows that the board has started; it is not consumed,
+    so (0, 0) is returned. Raises `DeviceError` if the reply reports an error.
     """
     reply: int | tuple[int, int] = 0
     start = received.find(PUSH)

@@ -72,7 +72,7 @@ class PtsLayout:
 
 
 def layouts(frames: Bytes) -> Iterator[tuple[Int64s, PtsLayout | None]]:
-    """Yield (rows, layout) for each layout among ``frames`` (frame, byte). The layout is None for rows with invalid tables.
+    """Yield (rows, layout) for each layout among ``frames`` (frame, byte); the layout is None for rows with invalid tables.
 
     Tables are parsed once per layout. Other frames are only compared with the cached layouts of their size.
     """
@@ -108,7 +108,7 @@ def _cached_layouts(size: int) -> list[PtsLayout]:
     return []
 
 
-def are_whole(frames: Bytes) -> Bools:
+def are_valid(frames: Bytes) -> Bools:
     """Return a mask (frame,) of the ``frames`` (frame, byte) with the right sum and valid tables."""
     start, stop = len(MARKER), len(TAIL)
     if frames.shape[1] < start + stop + 3:
@@ -174,7 +174,7 @@ class _Tables:
         return int.from_bytes(self.body[offset : offset + size], "little")
 
     def blocks(self) -> dict[int, tuple[int, int]]:
-        """Return (start, stop) of each block by type."""
+        """Return start and stop of each block by type. Raises `_NoLayoutError` for invalid tables."""
         _require(1 <= self.width <= 8)
         starts: dict[int, int] = {}
         offset, stop = 1, len(self.body) - 2
@@ -191,7 +191,10 @@ class _Tables:
         return {block: (start, edges[edges.index(start) + 1]) for block, start in starts.items()}
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return (start, stop) of each entry of the table at ``start``. The entries follow the table up to ``stop``."""
+        """Return start and stop of each entry of the table at ``start``. The entries follow the table up to ``stop``.
+
+        Raises `_NoLayoutError` if the offsets are invalid.
+        """
         count = self.number(start)
         first = start + 2 + count * self.width
         _require(first <= stop)
@@ -226,6 +229,7 @@ def template(sensors: int, pillars: int, *, slip: bool) -> bytes:
 
 
 def _table(entries: list[bytes]) -> bytes:
+    """Return a table of entries: their number, their offsets, and their contents."""
     offset, offsets = 2 + WIDTH * len(entries), b""
     for entry in entries:
         offsets += offset.to_bytes(WIDTH, "little")
@@ -273,6 +277,10 @@ class FreshFramer:
     def _decide(
         self, runs: list[FrameRun], losses: list[FramingLoss], *, at_end: bool
     ) -> tuple[list[FrameRun], list[FramingLoss]]:
+        """Return the frames of this session, and the losses with the stale frames; while it is undecided, no frames.
+
+        Delayed frames are kept until the jump of the counter could have occurred, or the stream is ``at_end``.
+        """
         assert self._pending is not None
         self.account.framed -= sum(run.frames.size for run in runs)
         self._pending += runs
@@ -288,7 +296,7 @@ class FreshFramer:
         return fresh, losses
 
     def _split_at_jump(self, runs: list[FrameRun]) -> tuple[list[FrameRun], list[FrameRun]]:
-        """Return the runs before the last jump, and the runs after it."""
+        """Return the runs of frames before the last jump of the counter, and the runs after it."""
         if not runs:
             return [], []
         counters = np.concatenate([self._counters(run.frames) for run in runs])
@@ -296,11 +304,11 @@ class FreshFramer:
         half = self._modulus // 2
         steps = (np.diff(counters[t_ns - t_ns[0] < SETTLE_NS]) + half) % self._modulus - half
         jumps = np.flatnonzero((steps < 0) | (steps > self._max_step))
-        dropped = int(jumps[-1]) + 1 if len(jumps) else 0  # frames to drop
+        remaining = int(jumps[-1]) + 1 if len(jumps) else 0  # stale frames
         stale, fresh = [], []
         for run in runs:
-            count = min(dropped, len(run.t_ns))
-            dropped -= count
+            count = min(remaining, len(run.t_ns))
+            remaining -= count
             if count:
                 stale.append(FrameRun(run.frames[:count], run.t_ns[:count]))
             if count < len(run.t_ns):

@@ -73,6 +73,7 @@ class Robotiq(Sensor):
     baud: int = 115_200  # baud rate of the port
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` if an option has a value that the device does not support."""
         sensor.check_range("robotiq", "fingers", self.fingers, 1, 2)
         for part in self.parts:
             sensor.check_choice("robotiq", "parts", part, KINDS)
@@ -98,14 +99,12 @@ class Robotiq(Sensor):
         They are grouped by type: first the taxels of both fingers (uint16), then the int16 channels, then the clocks
         (uint64).
         """
-        return [
-            channel
-            for parts in (("static",), SIGNED, ("timestamp",))
-            for finger in range(1, self.fingers + 1)
-            for part in parts
-            if part in self.parts
-            for channel in _fields(part, finger)
-        ]
+        fields = []
+        for parts in (("static",), SIGNED, ("timestamp",)):
+            for finger in range(1, self.fingers + 1):
+                for part in parts:
+                    fields += _fields(part, finger) if part in self.parts else []
+        return fields
 
     def framer(self) -> Framer:
         """Return a framer for packets that consist of known fields, or are a reply."""
@@ -208,6 +207,7 @@ class _Fingertips(Device):
     version: bytes = field(default=b"\x01\x00\x00")
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process packets of the host, which set the rate or request packets, and return the replies."""
         self.heard += data
         replies = []
         while (start := self.heard.find(START)) >= 0 and len(self.heard) >= start + HEADER:
@@ -241,7 +241,7 @@ def command(code: int, data: bytes = b"") -> bytes:
 
 @functools.lru_cache(maxsize=64)
 def _columns(groups: tuple[tuple[Key, ...], ...], layout: Layout) -> Columns | None:
-    """Return the byte columns of each group of fields, or None if a field is missing."""
+    """Return the byte offsets of the values of each group of fields, or None if the layout lacks a field."""
     offsets = dict(layout)
     if any(key not in offsets for keys in groups for key in keys):
         return None
@@ -286,20 +286,24 @@ def _structure(frame: bytes) -> Structure:
 
 
 def _group_by_layout(frames: Bytes, rows: Indices) -> Iterator[tuple[Indices, Layout | None]]:
-    """Yield (rows, layout) for each group of ``rows`` of frames of one size with the same fields."""
+    """Yield (rows, layout) for each group of ``rows`` of frames of one size with the same fields.
+
+    The layout is None if the packets of a group do not consist of known fields.
+    """
     size = frames.shape[1]
-    while len(rows):
-        selected = frames if len(rows) == len(frames) else frames[rows]
+    remaining = rows
+    while len(remaining):
+        selected = frames if len(remaining) == len(frames) else frames[remaining]
         structure = _latest.get(size)
         if structure is None or (selected[0, structure.offsets] != structure.values).any():
             structure = _latest[size] = _structure(selected[0].tobytes())
         same = selected.take(structure.offsets, axis=1) == structure.values
         if same.all():
-            yield rows, structure.layout
+            yield remaining, structure.layout
             return
         matches = same.all(axis=1)
-        yield rows[matches], structure.layout
-        rows = rows[~matches]
+        yield remaining[matches], structure.layout
+        remaining = remaining[~matches]
 
 
 def _is_packet(frames: Bytes) -> Bools:

@@ -72,11 +72,10 @@ class SpaceMouse(Sensor):
 
         A list of reports, as returned by `encode`, is decoded from the rest state.
         """
-        if isinstance(frames, list):
-            frames = accumulate(frames, np.zeros(FRAME, dtype=np.uint8))
-        rows = np.flatnonzero(frames[:, 0] != BATTERY)
-        axes = np.ascontiguousarray(frames[rows, 1:13]).view("<i2").astype(np.int16)
-        buttons = np.ascontiguousarray(frames[rows, 13:]).view("<u4").astype(np.uint32)
+        states = accumulate(frames, np.zeros(FRAME, dtype=np.uint8)) if isinstance(frames, list) else frames
+        rows = np.flatnonzero(states[:, 0] != BATTERY)
+        axes = np.ascontiguousarray(states[rows, 1:13]).view("<i2").astype(np.int16)
+        buttons = np.ascontiguousarray(states[rows, 13:]).view("<u4").astype(np.uint32)
         return Samples((axes, buttons), rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:

@@ -49,6 +49,7 @@ class Tap(Sensor):
     rate_hz: float = 0.0  # records per second; 0: irregular
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for invalid or repeated columns, and for columns besides a grasp."""
         columns = [_column(entry) for entry in self.numbers]
         for entry, column in zip(self.numbers, columns, strict=True):
             if not ENTRY.fullmatch(entry) or column in RESERVED or columns.count(column) > 1 or not column[0].isalpha():
@@ -118,6 +119,7 @@ class Tap(Sensor):
         ]
 
     def _is_valid(self, packet: bytes) -> bool:
+        """Return whether a packet consists of valid records."""
         try:
             records = [json.loads(line.decode()) for line in _lines(packet)]
             return bool(records) and all(self._is_record(record) for record in records)
@@ -162,7 +164,7 @@ class Tap(Sensor):
 
 
 def _is_grasp(entry: Any, *, with_wrist: bool) -> bool:
-    """Return whether an entry is a valid grasp, with a wrist if ``with_wrist``."""
+    """Return whether a JSON value is a valid grasp, with a wrist if ``with_wrist``."""
     try:
         points = [np.array(entry[name], dtype=np.float64) for name in ("g1", "g2")]
         wrist = np.array(entry["R"], dtype=np.float64) if with_wrist else None
@@ -202,14 +204,15 @@ def _unit(entry: str) -> str:
 
 def _value_at(record: Any, path: Sequence[str]) -> Any:
     """Return the value at a path of keys and list indices, or None if there is none."""
+    value = record
     for part in path:
-        if isinstance(record, Mapping):
-            record = record.get(part)
-        elif isinstance(record, list) and part.isdecimal() and int(part) < len(record):
-            record = record[int(part)]
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list) and part.isdecimal() and int(part) < len(value):
+            value = value[int(part)]
         else:
             return None
-    return record
+    return value
 
 
 def _put(record: Any, path: Sequence[str], value: float) -> None:

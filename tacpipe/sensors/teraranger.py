@@ -87,6 +87,7 @@ class _Evo(Device):
     started = False
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Process commands of the host: the stream runs after it was started with binary frames. There are no replies."""
         self.heard += data
         while (start := self.heard.find(0x00)) >= 0 and len(self.heard) >= start + 4:
             size = 4 if self.heard[start + 1] == BINARY[1] else 5

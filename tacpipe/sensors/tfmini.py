@@ -58,6 +58,7 @@ class TfMini(Sensor):
     baud: int = 115200  # baud rate of the sensor
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for options that the model or the baud rate does not support."""
         if self.model not in MODELS or self.unit not in UNITS:
             raise UsageError(
                 f"tfmini: model {self.model!r} with unit {self.unit!r} is unknown; "
@@ -116,7 +117,7 @@ class TfMini(Sensor):
         return np.hstack([body, sum8(body)[:, None]])
 
     def opening(self, local: LocalAddress) -> Dialogue:
-        """Set unit and rate, and start the stream. The original streams by itself and receives no commands."""
+        """Yield the commands that set unit and rate and start the stream; the original receives no commands."""
         if self.model == "original":
             return
         yield _request(UNIT, bytes([UNITS[self.unit]]))
@@ -134,6 +135,7 @@ class _TfMini(Device):
     """An emulated sensor, which answers commands with an echo or a status."""
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Return the replies to commands with the right checksum; other bytes are skipped."""
         self.heard += data
         replies = []
         while (start := self.heard.find(0x5A)) >= 0 and len(self.heard) >= start + 2:
@@ -147,6 +149,7 @@ class _TfMini(Device):
         return replies
 
     def _replies(self, number: int, payload: bytes) -> list[bytes]:
+        """Return the replies to one command; rate and start change the stream."""
         if number == VERSION:
             return [command(VERSION, b"\x01\x02\x03")]
         if number == SAVE:
@@ -177,7 +180,7 @@ def _request(number: int, payload: bytes = b"") -> Ask:
 def _reply_finder(number: int, payload: bytes) -> Callable[[bytes], int | tuple[int, int]]:
     """Return a function that returns the start and stop of the reply in received bytes, or 0 if there is none yet.
 
-    Frames may contain the first bytes of the reply by chance.
+    It raises `DeviceError` if the settings were not saved. Frames may contain the first bytes of the reply by chance.
     """
     size = 5 if number == SAVE else len(payload) + 4
     head = bytes([0x5A, size, number])

@@ -147,6 +147,7 @@ class UrRtde(Sensor):
     rate_hz: float = 500.0  # samples per second: up to 500 for an e-Series, 125 for a CB3
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for unknown or repeated outputs, and for an invalid rate."""
         unknown = [name for name in self.outputs if type_of(name) is None or name == STAMP]
         if unknown or not self.outputs or len(set(self.outputs)) < len(self.outputs):
             problem = (
@@ -208,10 +209,10 @@ class UrRtde(Sensor):
         packages["size"], packages["type"], packages["recipe"] = self.package.itemsize, DATA, 1
         packages[STAMP] = samples.t_device_ns / 1e9
         for name, block in zip(self.outputs, samples.values, strict=True):
-            wire = (
+            wire_values = (
                 np.hstack([block[:, :3], kinematics.quaternions_to_vectors(block[:, 3:])]) if name in POSES else block
             )
-            packages[name] = wire[:, 0] if packages[name].ndim == 1 else wire
+            packages[name] = wire_values[:, 0] if packages[name].ndim == 1 else wire_values
         return packages.view(np.uint8).reshape(len(samples), self.package.itemsize)
 
     def opening(self, local: LocalAddress) -> Dialogue:
@@ -256,6 +257,7 @@ class _RtdeController(Device):
         self.outputs = (STAMP, *sensor.outputs)
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Return the replies to packages: version, controller, recipe of outputs or inputs, start or pause."""
         self.heard += data
         replies = []
         for kind, package in _pop_packages(self.heard):
@@ -301,7 +303,10 @@ def _pop_packages(data: bytearray) -> Iterator[tuple[int, bytes]]:
 
 
 def _ask(kind: int, payload: bytes) -> Ask:
-    """Return a request whose reply has the same type. Text packages may precede the reply."""
+    """Return a request whose reply has the same type. Text packages may precede the reply.
+
+    Finding the reply raises `DeviceError` for bytes that are not RTDE.
+    """
 
     def find(data: bytes) -> int | tuple[int, int]:
         offset = 0

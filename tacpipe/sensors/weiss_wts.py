@@ -54,6 +54,7 @@ class WeissWts(Sensor):
     baud: int = 115200  # baud rate; any rate works over USB
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for an invalid size of the matrix or rate."""
         if self.rows < 1 or self.columns < 1:
             raise UsageError(f"weiss-wts: rows is {self.rows} and columns is {self.columns}; both must be 1 or more.")
         if not 1 <= self.rate_hz <= 1000 or abs(1000 / self.rate_hz - self.delay_ms) > 0.01:
@@ -83,6 +84,7 @@ class WeissWts(Sensor):
         return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, max_size=largest, check=self._are_valid))
 
     def _are_valid(self, frames: Bytes) -> Bools:
+        """Return a mask (frame,) of the frames with the right checksum and number of cells."""
         is_valid: Bools = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
         rows = np.flatnonzero(is_valid & (frames[:, 3] == FRAME))
         if len(rows):
@@ -105,10 +107,10 @@ class WeissWts(Sensor):
         cells = np.zeros((len(rows), self.cells), dtype=np.uint16)
         if not len(rows):
             return Samples((cells,), t_device_ns=rows, rows=rows)
-        frames = frames[rows]
-        ticks = np.ascontiguousarray(frames[:, HEADER : HEADER + 4]).view("<u4")[:, 0]
-        is_run_length = (frames[:, HEADER + 4] & RUN_LENGTH).astype(bool)
-        words = _words(frames)
+        with_cells = frames[rows]
+        ticks = np.ascontiguousarray(with_cells[:, HEADER : HEADER + 4]).view("<u4")[:, 0]
+        is_run_length = (with_cells[:, HEADER + 4] & RUN_LENGTH).astype(bool)
+        words = _words(with_cells)
         if not is_run_length.all():
             cells[~is_run_length] = words[~is_run_length]
         packed = words[is_run_length]
@@ -169,6 +171,7 @@ class _Wts(Device):
         self.sensor = sensor
 
     def hear(self, data: bytes) -> list[bytes]:
+        """Return the replies to the complete messages of the host."""
         self.heard += data
         replies, stop = [], 0
         for number, stop, payload in messages(bytes(self.heard)):  # noqa: B007
@@ -177,17 +180,18 @@ class _Wts(Device):
         return replies
 
     def _execute(self, number: int, payload: bytes) -> bytes:
-        accepted, unknown = b"\x00\x00", b"\x0e\x00"
+        """Execute a command and return its reply: a code for success or an unknown command, and the data."""
+        success, unknown = b"\x00\x00", b"\x0e\x00"
         if number == MATRIX:
             sizes = (self.sensor.columns, self.sensor.rows, 340, 340, VALUE_MASK)  # cells are 3.4 mm wide, in 1/100 mm
-            return accepted + b"".join(size.to_bytes(2, "little") for size in sizes)
+            return success + b"".join(size.to_bytes(2, "little") for size in sizes)
         if number == START and len(payload) == 3:
             self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(payload[1:], "little"))
         elif number == STOP:
             self.streaming = False
         elif number != TARE:
             return unknown
-        return accepted
+        return success
 
 
 def message(number: int, payload: bytes = b"") -> bytes:
@@ -227,7 +231,10 @@ def run_lengths(cells: Counts) -> Counts:
 
 
 def _reply_finder(number: int, *, refusable: bool = False) -> Callable[[bytes], int | tuple[int, int]]:
-    """Return a function that returns the start and stop of the reply among frames, or 0 if there is none yet."""
+    """Return a function that returns the start and stop of the reply among frames, or 0 if there is none yet.
+
+    It raises `DeviceError` if the sensor refused the command, unless that is ``refusable``.
+    """
 
     def find(data: bytes) -> int | tuple[int, int]:
         for packet, stop, payload in messages(data):

@@ -178,6 +178,7 @@ def _counts(texts: Sequence[str], width: int) -> Counts:
 def _text(
     sensor: int, taxels: int, number: int, stamp_s: float, counts: Sequence[int], forces: Sequence[float] | None
 ) -> bytes:
+    """Return the server's message with one reading; ``forces`` are left out if they are None or not finite."""
     reading = {
         "sensor": str(sensor),
         "time": stamp_s,

@@ -54,17 +54,18 @@ class ClientSettings:
     """Settings of the client besides the address. Their representation contains no credentials."""
 
     config: dict[str, str | bool] = field(default_factory=dict, repr=False)
-    provider: Any = field(default=None, repr=False)  # provides credentials that change, such as those of roles
+    # provides credentials that change, such as the temporary ones of a role
+    provider: Any = field(default=None, repr=False)
     plaintext: bool = False  # whether the server is accessed without TLS
-    url: str = ""  # replaces the address if not empty
+    url: str = ""  # replaces the address unless it is empty
 
 
-def parsed(text: str) -> BucketAddress | Path:
+def parse_address(text: str) -> BucketAddress | Path:
     """Parse an address or a path; ``file:///lab/store`` is a path too.
 
     Raises `UsageError` for an unsupported scheme, and for an address with credentials or options.
 
-    >>> parsed("/lab/store"), parsed("file:///lab/store"), str(parsed("s3://lab/store/"))
+    >>> parsed("/lab/store"), parsed("file:///lab/store"), str(parse_address("s3://lab/store/"))
     (PosixPath('/lab/store'), PosixPath('/lab/store'), 's3://lab/store')
     """
     match = _ADDRESS.fullmatch(text)
@@ -93,9 +94,10 @@ def parsed(text: str) -> BucketAddress | Path:
 
 
 def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ) -> ClientSettings:
-    """Return the settings that the client does not read from the environment itself: a profile's, and whether TLS is used.
+    """Return the client's settings that it does not read from the environment itself.
 
-    Raises `UsageError` if the selected profile does not exist.
+    These are the settings of a profile, and whether TLS is used. Raises `UsageError` if the selected profile does not
+    exist.
     """
     if address.scheme == "az":  # the client expects the account as a setting
         account, _, container_path = address.path.partition("/")
@@ -106,7 +108,7 @@ def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ
     client_settings = ClientSettings({"disable_bulk_delete": True})
     profile = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
     if profile or not any(environment.get(name) for name in _OWN):
-        _fill(client_settings, profile, environment)
+        _add_profile(client_settings, profile, environment)
     endpoints = (environment.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"))
     endpoint = next(
         (candidate for candidate in endpoints if candidate), str(client_settings.config.get("endpoint", ""))
@@ -117,8 +119,11 @@ def settings(address: BucketAddress, environment: Mapping[str, str] = os.environ
     return client_settings
 
 
-def _fill(client_settings: ClientSettings, profile_name: str, environment: Mapping[str, str]) -> None:
-    """Add the settings of the profile. As in other tools, credentials in the environment take precedence."""
+def _add_profile(client_settings: ClientSettings, profile_name: str, environment: Mapping[str, str]) -> None:
+    """Add the settings of a profile. As in other tools, credentials in the environment take precedence.
+
+    Raises `UsageError` if the profile does not exist or a file of profiles cannot be read.
+    """
     home = Path(environment.get("HOME") or "~").expanduser() / ".aws"
     files = [
         (environment.get("AWS_CONFIG_FILE") or home / "config", "profile "),
@@ -126,13 +131,13 @@ def _fill(client_settings: ClientSettings, profile_name: str, environment: Mappi
     ]
     name, exists = profile_name or "default", False
     profile: dict[str, str] = {}
-    for path, before in files:
+    for path, section_prefix in files:
         reader = configparser.RawConfigParser()
         try:
             reader.read(path, encoding="utf-8")
         except (configparser.Error, UnicodeDecodeError):  # the error's text could contain a credential
             raise UsageError(f"{path} is not a file of profiles: a line of it cannot be read.") from None
-        for section in (name, f"{before}{name}"):
+        for section in (name, f"{section_prefix}{name}"):
             if reader.has_section(section):
                 exists = True
                 profile.update(reader.items(section))

@@ -84,17 +84,17 @@ def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes
     Returns None only if both responses agree, because a response may be damaged in transit. Raises `StorageError` if
     they differ, and `FileNotFoundError` if the file does not exist.
     """
-    answers: list[bytes | str] = []
+    responses: list[bytes | str] = []
     for _ in range(2):
         try:
-            answer: bytes | str = files.read(name, max_bytes)
+            response: bytes | str = files.read(name, max_bytes)
         except regular.IrregularError as error:
-            answer = str(error)
-        parsed = parse(answer) if isinstance(answer, bytes) else None
+            response = str(error)
+        parsed = parse(response) if isinstance(response, bytes) else None
         if parsed is not None:
             return parsed
-        answers.append(answer)
-    if answers[0] != answers[1]:
+        responses.append(response)
+    if responses[0] != responses[1]:
         raise StorageError(
             f"{files.place} returns different content for {name} each time, so damage cannot be determined. Check the "
             f"connection and the server, then run the same command again."
@@ -131,7 +131,7 @@ class Directory:
             return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive)
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
-        """Implement `Backend.read`."""
+        """Implement `Backend.read`; raises `StorageError` if the system fails to read the file."""
         try:
             return regular.content(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
@@ -140,7 +140,7 @@ class Directory:
             raise read_error(self.path(name), error) from error
 
     def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
-        """Implement `Backend.blocks`."""
+        """Implement `Backend.blocks`; raises `StorageError` if the system fails to read the file."""
         try:
             yield from regular.blocks(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
@@ -149,7 +149,7 @@ class Directory:
             raise read_error(self.path(name), error) from error
 
     def stat(self, name: str) -> Entry | None:
-        """Implement `Backend.stat`."""
+        """Implement `Backend.stat`; raises `StorageError` if the system fails."""
         path = self.path(name)
         try:
             status = os.lstat(path)  # called once per shard, and os is 5 times faster than pathlib

@@ -74,7 +74,10 @@ class Bucket:
         return True
 
     def _create(self, name: str, content: bytes) -> bool:
-        """Create a name with one request. Raises `StorageError` if the server refuses that, and nothing has the name."""
+        """Create a name with one request; return False if it exists.
+
+        Raises `StorageError` if the server refuses the request although nothing has the name.
+        """
         import obstore
 
         tries = 0
@@ -84,10 +87,8 @@ class Bucket:
             tries += 1
             try:
                 obstore.put(self._client, name, content, mode="create")
-            except (
-                obstore.exceptions.AlreadyExistsError
-            ):  # S3 also returns this if requests collide and nothing was stored
-                if self.stat(name) is None:
+            except obstore.exceptions.AlreadyExistsError:
+                if self.stat(name) is None:  # S3 also returns this if requests collide and nothing was stored
                     return None
                 return tries > 1 and self.read(name) == content  # a request whose response was lost may have succeeded
             return True
@@ -116,14 +117,18 @@ class Bucket:
         return self._blocks(name, max_bytes)
 
     def _blocks(self, name: str, max_bytes: int | None) -> Iterator[bytes]:
+        """Yield the content of a name, fetching parts concurrently.
+
+        Raises `IrregularError` if it exceeds ``max_bytes``.
+        """
         import obstore
 
-        def begin() -> tuple[bytes, int]:
+        def fetch_first() -> tuple[bytes, int]:
             response = obstore.get(self._client, name)
             size = int(response.meta["size"])
             return bytes(response.bytes()) if size <= PART_BYTES else b"", size
 
-        first, size = self._retry(begin)
+        first, size = self._retry(fetch_first)
         if max_bytes is not None and size > max_bytes:
             raise regular.IrregularError(
                 f"{self.place}/{name} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged "
@@ -135,13 +140,13 @@ class Bucket:
             yield first
             return
         with self._large, ThreadPoolExecutor(_AHEAD) as threads:
-            waiting: deque[Future[bytes]] = deque()
+            parts: deque[Future[bytes]] = deque()
             for start in range(0, size, PART_BYTES):
-                waiting.append(threads.submit(self._range, name, start, min(start + PART_BYTES, size)))
-                if len(waiting) > _AHEAD:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+                parts.append(threads.submit(self._range, name, start, min(start + PART_BYTES, size)))
+                if len(parts) > _AHEAD:
+                    yield parts.popleft().result()
+            while parts:
+                yield parts.popleft().result()
 
     def _range(self, name: str, start: int, end: int) -> bytes:
         import obstore
@@ -149,7 +154,7 @@ class Bucket:
         return self._retry(lambda: bytes(obstore.get_range(self._client, name, start=start, end=end)))
 
     def stat(self, name: str) -> Entry | None:
-        """Implement `Backend.stat`."""
+        """Implement `Backend.stat`, returning None if the name does not exist."""
         import obstore
 
         try:
@@ -206,7 +211,11 @@ class Bucket:
             self._retry(lambda: obstore.delete(self._client, name))
 
     def _retry(self, request: Callable[[], Result], tries: int = 0) -> Result:
-        """Return the result of a request, repeating it if the connection or the server fails. Raises `StorageError`."""
+        """Return the result of a request, repeating it if the connection or the server fails.
+
+        Raises `FileNotFoundError` if the name does not exist, and the error of `_describe_error` if all ``tries`` (0:
+        `TRIES`) fail.
+        """
         import obstore
         from obstore.exceptions import BaseError
 
@@ -216,18 +225,18 @@ class Bucket:
                 return request()
             except obstore.exceptions.GenericError as error:
                 if remaining_tries == 0 or not _may_pass(error):
-                    raise self._sentence(error) from None  # the client's error may contain confidential text
+                    raise self._describe_error(error) from None  # the client's error may contain confidential text
             except FileNotFoundError as error:
                 if any(mark in str(error) for mark in _NO_BUCKET):
-                    raise self._sentence(error) from None
+                    raise self._describe_error(error) from None
                 raise FileNotFoundError(f"{self.place} has no such name") from None
             except BaseError as error:
-                raise self._sentence(error) from None
+                raise self._describe_error(error) from None
             time.sleep(pause_s * random.uniform(0.5, 1.5))
             pause_s *= 4
         raise AssertionError
 
-    def _sentence(self, error: Exception) -> StorageError | UsageError:
+    def _describe_error(self, error: Exception) -> StorageError | UsageError:
         """Return an error that describes the server's response; only the status of its text is shown."""
         from obstore.exceptions import PermissionDeniedError, UnauthenticatedError
 
@@ -258,11 +267,11 @@ class Bucket:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Return whether a repeated request may succeed, which excludes requests that the server understood and refused."""
+    """Return whether a request may succeed if it is repeated: the server did not understand and refuse it."""
     text = str(error)
     status = _STATUS.search(text)
-    lasting = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")
-    return not lasting and not any(mark in text for mark in (*_METADATA, "builder error"))
+    is_refusal = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")
+    return not is_refusal and not any(mark in text for mark in (*_METADATA, "builder error"))
 
 
 def _part(blocks: Iterator[bytes]) -> bytes:
@@ -285,7 +294,10 @@ def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _connect(address: BucketAddress) -> Any:
-    """Return obstore's client for an address, with credentials from the environment or a profile."""
+    """Return obstore's client for an address, with credentials from the environment or a profile.
+
+    Raises `UsageError` if the client refuses the settings.
+    """
     with extras.explain_missing(f"A store at {address.scheme}://"):
         from obstore.exceptions import BaseError
         from obstore.store import from_url

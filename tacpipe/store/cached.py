@@ -38,10 +38,10 @@ def folder(address: BucketAddress) -> Path:
     Its name contains a digest of address and server, because the same address on another server is another store.
     """
     cache = os.environ.get(VARIABLE)
-    above = Path(cache).expanduser() if cache else _user_cache() / "tacpipe"
+    parent = Path(cache).expanduser() if cache else _user_cache() / "tacpipe"
     endpoint = addresses.settings(address).config.get("endpoint", "")
     label = "-".join([address.scheme, *address.path.split("/")])[:80].replace(" ", "_")
-    return above.absolute() / f"{label}-{digest([str(address), endpoint])[:12]}"
+    return parent.absolute() / f"{label}-{digest([str(address), endpoint])[:12]}"
 
 
 def _user_cache() -> Path:
@@ -121,7 +121,7 @@ class CachedStore(Store):
         super().announce(announced)
 
     def _announce(self, names: Collection[str], *, manifests: Collection[str] = (), keys: Collection[str] = ()) -> None:
-        """Announce objects in the bucket if the run started here; for a worker, the starting process does it."""
+        """Announce objects in the bucket if the run started in this process; a worker's run is announced by its starter."""
         if self._work is None:
             return
         if not self._is_announced:
@@ -132,12 +132,12 @@ class CachedStore(Store):
 
     def expect(self, keys: Iterable[str]) -> None:
         """Fetch the missing records of ``keys`` from the bucket, and announce the keys that will be computed."""
-        unknown = [key for key in keys if key not in self._no_record and not present(self.record_path(key))]
-        if not unknown:
+        uncached_keys = [key for key in keys if key not in self._no_record and not present(self.record_path(key))]
+        if not uncached_keys:
             return
-        self._announce((), keys=unknown)
-        stored_keys = self.bucket.present(unknown)
-        self._no_record.update(set(unknown) - stored_keys)
+        self._announce((), keys=uncached_keys)
+        stored_keys = self.bucket.present(uncached_keys)
+        self._no_record.update(set(uncached_keys) - stored_keys)
         for _, record in self.bucket.records(stored_keys):
             self._keep_record(record)
             self._requested.update(records.digests(record["result"]))
@@ -164,7 +164,7 @@ class CachedStore(Store):
         return stored_bytes is not None and size in (None, stored_bytes)
 
     def _query_bucket(self, names: Iterable[str]) -> None:
-        """Query the bucket once for these objects."""
+        """Look up the sizes of these objects, unless they are known, with one query of the bucket."""
         unknown = [name for name in names if name not in self._bucket_sizes and not present(self.object_path(name))]
         self._requested.clear()
         self._announce(unknown)
@@ -248,7 +248,7 @@ class CachedStore(Store):
         self._complete(sizes)
 
     def _upload(self, names: Collection[str]) -> None:
-        """Upload objects from the cache. Raises `MissingError` if one is damaged."""
+        """Upload objects from the cache. Raises `MissingError` if one is damaged in the cache."""
 
         def send(name: str) -> None:
             self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
@@ -336,16 +336,17 @@ class CachedStore(Store):
         """Store ``manifest`` and everything that it ``needs`` in the bucket, as the dataset ``name`` of a project.
 
         ``needs`` maps the digest of a cached manifest to the sizes of its objects by name, and other digests to
-        nothing. ``before`` is the last known manifest of that name: objects of the bucket's newest version have been
-        needed since it was named, so they exist and are not checked. ``lasting`` is as in `Store.roots`. Raises
-        `TacpipeError` if other commands write the same name again and again.
+        nothing. ``before`` is the last known manifest of that name; if it is still the newest in the bucket, its
+        objects exist and are not checked. ``lasting`` is as in `Roots.set`. Raises `TacpipeError` if other commands
+        write the same name again and again.
         """
         roots = self.bucket.roots
         root = roots.pushed(name, project["id"])
         if root is not None and root["manifest"] == manifest:
             return
         with self.at_work([manifest]):
-            needed, previously_needed = needs(manifest), needs(before) if before else {}
+            needed = needs(manifest)
+            previously_needed = needs(before) if before else {}
             self._announce(needed.keys() - previously_needed.keys(), manifests=[before] if previously_needed else [])
             root = roots.pushed(name, project["id"])
             if root is None or root["manifest"] != before:
@@ -363,9 +364,10 @@ class CachedStore(Store):
         )
 
     def _complete(self, sizes: Mapping[str, int]) -> None:
-        """Upload announced objects that the bucket lacks. Raises `MissingError` if one is missing in the cache too.
+        """Upload announced objects that the bucket lacks, whose sizes in bytes are given by name.
 
-        Objects uploaded earlier are checked too, because a collection may have run before the announcement.
+        Objects uploaded earlier are checked too, because a collection may have run before the announcement. Raises
+        `MissingError` if one is also missing in the cache.
         """
         sizes_in_bucket = self.bucket.sizes(sizes)
         absent = [name for name in sizes if sizes_in_bucket.get(name) != sizes[name]]

@@ -69,14 +69,14 @@ def record_name(key: str) -> str:
 
 
 def check(root: Path) -> bool:
-    """Return whether ``root`` is a store, or False if it is empty or missing, so that a store can be created.
+    """Return True if ``root`` is a store, and False if it is empty or missing, so that a store can be created.
 
     Raises `UsageError` for a folder with other content, for a store of another format, and if its folders are symbolic
     links. Changes nothing.
     """
     with readable_errors(root):
         mark = _mark(root)
-        if mark is None and not _may_begin(root):
+        if mark is None and not _is_empty(root):
             mark = _mark(root)  # another process may have created the store in between
             if mark is None:
                 raise UsageError(_not_a_store(root))
@@ -109,7 +109,7 @@ def entries(root: Path, name: str) -> Iterator[Path]:
 
     Entries that disappear in the meantime are skipped. Raises `StorageError` if the folder cannot be listed.
     """
-    return (Path(path) for path, ours in _contents(root, name) if ours)
+    return (Path(path) for path, is_ours in _contents(root, name) if is_ours)
 
 
 def names(root: Path, folder: str) -> Iterator[str]:
@@ -119,7 +119,7 @@ def names(root: Path, folder: str) -> Iterator[str]:
 
 def foreign(root: Path) -> list[str]:
     """Return the sorted paths in the store that do not belong to it, including symbolic links."""
-    paths = [path for name in _FORMS for path, ours in _contents(root, name) if not ours]
+    paths = [path for name in _FORMS for path, is_ours in _contents(root, name) if not is_ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
     paths += [entry.path for entry in _scan(root, root) if entry.name not in expected]
     return sorted(str(Path(path).relative_to(root)) for path in paths)
@@ -141,7 +141,7 @@ def _is_link(path: str | Path) -> bool:
 
 
 def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
-    """Yield the paths in a folder of the store and in its subfolders, and whether each belongs to the store."""
+    """Yield the paths in a folder of the store and in its subfolders, each with whether it belongs to the store."""
     folder = root / name
     if folder.is_symlink():
         yield str(folder), False
@@ -159,6 +159,7 @@ def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
 
 
 def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
+    """Return the entries of a folder sorted by name; an empty list if it does not exist."""
     with readable_errors(root):
         try:
             with os.scandir(folder) as entries:
@@ -168,7 +169,10 @@ def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
 
 
 def _mark(root: Path) -> str | None:
-    """Return the format in a store's mark, or None if there is no mark. Raises `UsageError` if it cannot be a store."""
+    """Return the format in a store's mark, or None if there is no mark.
+
+    Raises `UsageError` for a dangling link, for a file in place of the folder, and for a mark that cannot be read.
+    """
     try:
         with regular.opened(root / MARK) as file:
             return file.read(64).strip().decode(errors="replace")
@@ -185,14 +189,14 @@ def _mark(root: Path) -> str | None:
         raise UsageError(f"{_not_a_store(root)} ({error})") from None
 
 
-def _may_begin(root: Path) -> bool:
+def _is_empty(root: Path) -> bool:
     """Return whether a folder without a mark is empty, apart from files of a process that is creating a store."""
     for entry in _scan(root, root):
         if entry.name in _BESIDE:
             continue
         if entry.name not in _FORMS or not entry.is_dir(follow_symlinks=False):
             return False
-        if any(not (ours and entry.name in _BEGUN) for _, ours in _all_entries(root, entry.name)):
+        if any(not (is_ours and entry.name in _BEGUN) for _, is_ours in _all_entries(root, entry.name)):
             return False
     return True
 
@@ -205,6 +209,7 @@ def _all_entries(root: Path, name: str) -> Iterator[tuple[str, bool]]:
 
 
 def _not_a_store(root: Path) -> str:
+    """Return the message for a folder that is not empty and not a store."""
     names = [entry.name for entry in _scan(root, root)]
     return (
         f"{root} is not a store of tacpipe: it has no file {MARK} and is not empty ({listed(names, 4)}). Nothing in it was "

@@ -92,7 +92,10 @@ class Leases:
 
     @contextlib.contextmanager
     def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
-        """Announce to ``gc`` during the block that a run reads these manifests. Yields an object that announces objects."""
+        """Announce to ``gc`` during the block that a run reads these manifests.
+
+        Yields an object that announces further objects.
+        """
         path = self.folder / f"run-{uuid.uuid4().hex}.lock"
         handle = None
         while handle is None:  # gc may look at the file between its creation and the lock
@@ -109,7 +112,7 @@ class Leases:
     def runs(self) -> list[Run]:
         """Return the active runs with their announcements, and remove the leases of dead ones.
 
-        A run without announcements uses nothing yet.
+        A run without announcements does not use anything yet.
         """
         running = []
         for path in self._files():
@@ -201,10 +204,10 @@ def _release(path: Path, handle: int) -> None:
 
 
 def _read_lease(path: Path) -> Run:
-    return parsed(path, regular.content(path, LEASE_BYTES, follow=False))
+    return parse_lease(path, regular.content(path, LEASE_BYTES, follow=False))
 
 
-def parsed(path: Path, content: bytes) -> Run:
+def parse_lease(path: Path, content: bytes) -> Run:
     """Parse a lease: a line that describes its holder, then one line per used digest."""
     first, _, digests = content.decode("latin-1").partition("\n")
     try:
@@ -229,6 +232,7 @@ def note(**extra: Any) -> bytes:
 
 
 def _timeout_s() -> float:
+    """Return the timeout in seconds that the environment sets. Raises `TacpipeError` if it is not a number."""
     text = os.environ.get("TACPIPE_LOCK_TIMEOUT_S", "")
     try:
         return float(text) if text else LOCK_TIMEOUT_S
@@ -237,7 +241,10 @@ def _timeout_s() -> float:
 
 
 def _wait(path: Path, work: str, timeout_s: float) -> int:
-    """Wait until the lock is free and return its handle; report the holder on stderr."""
+    """Wait until the lock is free and return its handle; report the holder on stderr.
+
+    Raises `LockedError` after ``timeout_s``.
+    """
     began_s = time.monotonic()
     reported = False
     while True:
@@ -257,7 +264,7 @@ def _wait(path: Path, work: str, timeout_s: float) -> int:
 
 
 def _holder(path: Path, unknown: str = "Another process") -> str:
-    """Return a phrase with the holder of a lease and whether it is stopped."""
+    """Return a phrase with the holder of a lease and whether it is stopped, or ``unknown`` if there is no note on it."""
     note: Holder = {}
     with contextlib.suppress(OSError, TacpipeError):  # the holder's name only informs the user
         note = _read_lease(path).note
@@ -269,6 +276,7 @@ def _holder(path: Path, unknown: str = "Another process") -> str:
 
 
 def _is_stopped(note: Holder) -> bool:
+    """Return whether the holder is a process of this computer that a signal has stopped."""
     if note.get("host") != platform.node():
         return False
     try:
@@ -278,7 +286,10 @@ def _is_stopped(note: Holder) -> bool:
 
 
 def _seems_alive(path: Path) -> bool:
-    """Return whether a run may be active, on a file system without locks."""
+    """Return whether a run may be active, for file systems without locks.
+
+    On this computer its process must exist; on another, its lease must be younger than `_UNKNOWN_S`.
+    """
     note = _read_lease(path).note
     if note.get("host") == platform.node() and "pid" in note:
         try:
@@ -292,6 +303,7 @@ def _seems_alive(path: Path) -> bool:
 
 
 def _has_locks(handle: int) -> bool:
+    """Return whether the file system of an open file supports locks."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -326,6 +338,10 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
 
 
 def _open(path: Path, *, create: bool) -> int:
+    """Return a handle on a lease file; with ``create``, the file and its folder are created if they do not exist.
+
+    Raises `FileNotFoundError` without ``create``, and `PermissionError` if the file can be neither written nor read.
+    """
     flags = os.O_NOFOLLOW | (os.O_CREAT if create else 0)
     try:
         return os.open(path, os.O_RDWR | flags, 0o666)

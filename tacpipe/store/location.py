@@ -25,9 +25,9 @@ MARKS = (
 )
 
 
-def opened(place: str, run: str = "") -> Store:
+def open_store(place: str, run: str = "") -> Store:
     """Return the store at a path or address as in `Store.place`; ``run`` is the argument of `Store`."""
-    address = addresses.parsed(place)
+    address = addresses.parse_address(place)
     if isinstance(address, Path):
         return Store(address, run)
     from tacpipe.store.cached import CachedStore  # needed only for buckets
@@ -44,8 +44,8 @@ def locate(*datasets: Path) -> Store:
     """
     setting = os.environ.get("TACPIPE_STORE")
     if setting:
-        place = addresses.parsed(setting)
-        store = opened(str(place.absolute() if isinstance(place, Path) else place))
+        place = addresses.parse_address(setting)
+        store = open_store(str(place.absolute() if isinstance(place, Path) else place))
     else:
         store = Store(project(*datasets) / BESIDE_NAME)
         _refuse_other_owner(store.root)
@@ -69,7 +69,7 @@ def project(*datasets: Path) -> Path:
         start = Path.cwd()
         top = project_folder(start) or start
     for folder in (start, *start.parents):
-        if _marks(folder / BESIDE_NAME):
+        if _exists(folder / BESIDE_NAME):
             return folder
         if folder == top:
             break
@@ -79,17 +79,17 @@ def project(*datasets: Path) -> Path:
 def project_folder(path: Path) -> Path | None:
     """Return the nearest parent with a project mark, else the working directory if it is a parent, else None."""
     for folder in (path, *path.parents):
-        if any(_marks(folder / mark) for mark in MARKS):
+        if any(_exists(folder / mark) for mark in MARKS):
             return folder
     working_directory = Path.cwd()
     return working_directory if working_directory in path.parents else None
 
 
 def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
-    """Return the first of ``folders`` outside the datasets' projects whose store contains one of them, or None."""
+    """Return the first of ``folders`` outside the datasets' projects whose store contains one of the datasets, or None."""
     for folder in folders:
         root = folder / BESIDE_NAME
-        if not _marks(root) or _other_owner(root) is not None:
+        if not _exists(root) or _other_owner(root) is not None:
             continue
         store = Store(root)
         dataset = next((path for path in datasets if store.roots.get(path) is not None), None)
@@ -101,7 +101,7 @@ def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
 
 @functools.cache
 def _report_holder(root: Path, dataset: Path) -> None:
-    """Report once that a store outside the project is used."""
+    """Report that a store outside the project is used because it contains ``dataset``."""
     terminal.report_progress(
         f"the store {root} is used: it holds {dataset}, though no project is marked from there to here. If all below "
         f"{root.parent} is one project, run `tacpipe store init` there."
@@ -127,7 +127,7 @@ def _refuse_other_owner(root: Path) -> None:
         )
 
 
-def _marks(path: Path) -> bool:
+def _exists(path: Path) -> bool:
     """Return whether a mark exists; a link to an unmounted disk counts.
 
     Raises `StorageError` if that cannot be determined, because another store would be used without the mark.

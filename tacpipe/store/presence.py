@@ -67,9 +67,11 @@ class Note:
         if content is None:
             return None
         rows = []
-        for at in range(0, len(content), _ROW):
-            size, inode = content[at + 32 : at + 40], content[at + 40 : at + _ROW]
-            rows.append((content[at : at + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little")))
+        for offset in range(0, len(content), _ROW):
+            size, inode = content[offset + 32 : offset + 40], content[offset + 40 : offset + _ROW]
+            rows.append(
+                (content[offset : offset + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little"))
+            )
         return rows
 
     def content(self, shelf: str) -> bytes | None:
@@ -82,8 +84,8 @@ class Note:
         return content if hashlib.sha256(content).hexdigest() == expected_digest else None
 
 
-def encode_note(rows: Iterable[Row]) -> bytes:
-    """Return the encoded rows of objects."""
+def encode_rows(rows: Iterable[Row]) -> bytes:
+    """Return the encoded rows of objects: digest (32 bytes), size and inode (8 bytes each)."""
     parts = (
         bytes.fromhex(name) + size.to_bytes(8, "little") + inode.to_bytes(8, "little") for name, size, inode in rows
     )
@@ -105,16 +107,16 @@ def read_note(store: Store, directory: Path) -> Note | None:
 
 def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple[State | None, bytes]]) -> None:
     """Write a note atomically, without syncing it. ``shelves`` contains the state and the rows of each shelf."""
-    places, begin = {}, 0
+    shelf_index, begin = {}, 0
     for shelf, (state, content) in sorted(shelves.items()):
-        places[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()
+        shelf_index[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()
         begin += len(content) // _ROW
-    value = {"format": NOTE_FORMAT, **vars(head), "shelves": places}
-    first = json.dumps({**value, "check": digest(value)}).encode() + b"\n"
+    value = {"format": NOTE_FORMAT, **vars(head), "shelves": shelf_index}
+    head_line = json.dumps({**value, "check": digest(value)}).encode() + b"\n"
     file, draft = _file(store, directory), Path(store.draft())
     try:
         with draft.open("xb") as writing:
-            writing.writelines([first, *(content for _, (_, content) in sorted(shelves.items()))])
+            writing.writelines([head_line, *(content for _, (_, content) in sorted(shelves.items()))])
         file.parent.mkdir(exist_ok=True)
         if not layout.is_linked(str(store.root), file):
             draft.replace(file)
@@ -130,8 +132,8 @@ def forget_notes(store: Store, names: Iterable[str]) -> None:
             path.unlink(missing_ok=True)
 
 
-def shelved_notes(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield each shelf with its objects, in order."""
+def rows_by_shelf(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """Yield each shelf (the first two digits of a digest) with its objects, in order."""
     shelves: dict[str, list[Row]] = {}
     for row in rows:
         shelves.setdefault(row[0][:2], []).append(row)
@@ -184,14 +186,14 @@ class Look:
         head = note.head
         if not head.boot or head.boot != _boot() or self._directory_state is None:
             return False
-        same = head.directory == self._directory_state
+        is_same = head.directory == self._directory_state
         if listed:
             self.begin()
-            same = same and _state(self._directory) == self._directory_state
-        if not same and _listing_digest(self._directory_state, self.inodes) != head.listing:
+            is_same = is_same and _state(self._directory) == self._directory_state
+        if not is_same and _listing_digest(self._directory_state, self.inodes) != head.listing:
             return False
         changed = self._changed_shelves(note)
-        if not all(self._lie(note.rows(shelf)) for shelf in changed):
+        if not all(self._are_intact(note.rows(shelf)) for shelf in changed):
             return False
         if not listed and (head.directory != self._directory_state or len(changed) > _MAX_CHANGED):
             self._renew(note, changed)
@@ -213,8 +215,8 @@ class Look:
             if _inodes(self._directory) != inodes or not self._lists_inodes(rows):
                 return False
             shelves = {
-                shelf: (settled(self._shelves[shelf]), encode_note(shelf_rows))
-                for shelf, shelf_rows in shelved_notes(rows)
+                shelf: (settled(self._shelves[shelf]), encode_rows(shelf_rows))
+                for shelf, shelf_rows in rows_by_shelf(rows)
             }
             listing = _listing_digest(directory_state, inodes)
             write_note(
@@ -239,13 +241,13 @@ class Look:
             expected = dict(self.inodes)
             for path in before:
                 expected.pop(path, None)
-            placed = [*now]
-            new = [self._object_row(name) for _, name, _ in placed]
-            expected |= {path: row[2] for (path, _, _), row in zip(placed, new, strict=True)}
+            new_files = [*now]
+            new_rows = [self._object_row(name) for _, name, _ in new_files]
+            expected |= {path: row[2] for (path, _, _), row in zip(new_files, new_rows, strict=True)}
             inodes = _inodes(self._directory)
             if any(inodes.get(path) != inode for path, inode in expected.items()):
                 return False
-            added = dict(shelved_notes({*new, self._object_row(head.manifest)}))
+            added = dict(rows_by_shelf({*new_rows, self._object_row(head.manifest)}))
             settled = self._settled_states()
             shelves = {}
             for shelf in {*note.shelves, *added}:
@@ -255,7 +257,7 @@ class Look:
                 is_unchanged = shelf in note.shelves and note.shelves[shelf][0] == state
                 shelves[shelf] = (
                     state if is_unchanged else settled(state),
-                    content + encode_note(added.get(shelf, ())),
+                    content + encode_rows(added.get(shelf, ())),
                 )
             listing = _listing_digest(directory_state, inodes)
             write_note(
@@ -265,7 +267,7 @@ class Look:
         return False
 
     def _renew(self, note: Note, changed: Collection[str]) -> None:
-        """Note the current states of folders where that is safe; everything in the note was found."""
+        """Rewrite a note with the current states of folders, where that is safe. Everything in the note was found."""
         with contextlib.suppress(OSError, TacpipeError):
             settled = self._settled_states()
             directory_state = settled(self._directory_state) or note.head.directory
@@ -295,7 +297,7 @@ class Look:
             raise KeyError(name)
         return name, status.st_size, status.st_ino
 
-    def _lie(self, rows: Iterable[Row] | None) -> bool:
+    def _are_intact(self, rows: Iterable[Row] | None) -> bool:
         """Return whether every noted object is still in place and is the same file."""
         try:
             return rows is not None and all(self._object_row(row[0]) == row for row in rows)
@@ -304,7 +306,7 @@ class Look:
 
     def _lists_inodes(self, rows: Sequence[Row]) -> bool:
         """Return whether listing the directory shows the inodes of its files, which is not the case on every file system."""
-        return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
+        return self._are_intact(rows[:: max(1, len(rows) // _SAMPLE)])
 
     def _settled_states(self) -> Callable[[State | None], State | None]:
         """Return a function that maps a folder's state at the start of the check to None if the folder had just changed.
@@ -352,7 +354,7 @@ def _states(store: Store) -> dict[str, State | None]:
 
 
 def _state(folder: Path | str) -> State | None:
-    """Return the state of a folder, which changes when its names change, or None if it does not exist."""
+    """Return device, inode and change times of a folder, which change when its names change; None if it is not a folder."""
     try:
         status = os.lstat(folder)
     except OSError:

@@ -45,7 +45,8 @@ def place(directory: Path) -> tuple[Path, str]:
     folder = project(path)
     if project_folder(path) is None and folder not in path.parents:
         folder = path.parent
-    return folder, str(path.relative_to(folder)) if folder in path.parents else path.name or "dataset"
+    name = str(path.relative_to(folder)) if folder in path.parents else path.name
+    return folder, name or "dataset"
 
 
 def from_environment() -> Project | None:
@@ -104,7 +105,7 @@ def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
         return existing
     try:
         store.prepare()
-        _write(store, folder, Project(new_id(), _name(folder)), exclusive=True)
+        _write_identity(store, folder, Project(new_id(), _name(folder)), exclusive=True)
     except StorageError as error:
         if writable or not may_not_write(error):
             raise
@@ -131,10 +132,11 @@ def join(store: Store, folder: Path, project: Project) -> None:
             f"{VARIABLE} names the project {configured.name}, so --project {project.name} has no effect. Unset one."
         )
     store.prepare()
-    _write(store, folder, project, exclusive=False)
+    _write_identity(store, folder, project, exclusive=False)
 
 
-def _write(store: Store, folder: Path, project: Project, *, exclusive: bool) -> None:
+def _write_identity(store: Store, folder: Path, project: Project, *, exclusive: bool) -> None:
+    """Write the identity of the project in ``folder``; if it is ``exclusive``, an existing one stays."""
     kind, name = store.roots.kind_and_name(folder)
     value = {"kind": kind, "folder": name, **asdict(project)}
     file = _file(store, folder)

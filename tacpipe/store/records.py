@@ -160,7 +160,7 @@ class Record(ComputedResult):
 def record_content(
     identity: Identity, result: StoredResult, provenance: Provenance | RunProvenance
 ) -> tuple[Record, bytes]:
-    """Return the record of the ``result`` of ``identity``, with digests of itself, as canonical JSON."""
+    """Return the record of the ``result`` of ``identity``, with digests of itself, and its canonical JSON."""
     record: Record = {
         "identity": identity,
         "result": result,
@@ -177,24 +177,25 @@ def summary(record: Record) -> Summary:
 
 
 def parse_record(content: bytes, key: str) -> Record | None:
-    """Parse the record of ``key``, or return None if it is damaged. Raises `ValueError` if it is not JSON.
+    """Parse the record of ``key``, or return None if it is damaged.
 
     The digests of canonical JSON, as `record_content` returns it, are those of its parts, so nothing is encoded again.
+    Raises `ValueError` if it is not JSON.
     """
-    begins = _RECORD.match(content)
-    if begins is None:  # not canonical JSON, as records of format 1 may be
+    head = _RECORD.match(content)
+    if head is None:  # not canonical JSON, as records of format 1 may be
         record: Record = json.loads(content)
-        return record if _sound(record, key) else None
+        return record if _is_sound(record, key) else None
     text = content.decode("ascii")
-    identity, identity_end = _parse_at(text, begins.end())
+    identity, identity_end = _parse_at(text, head.end())
     provenance_start = _after(text, identity_end, ',"provenance":')
     provenance, provenance_end = _parse_at(text, provenance_start)
     result_start = _after(text, provenance_end, ',"result":')
     result, result_end = _parse_at(text, result_start)
     if text[result_end:] != "}":
         return None
-    check, digest_of_body = begins["check"].decode(), begins["digest"].decode()
-    identity_text = content[begins.end() : identity_end]
+    check, digest_of_body = head["check"].decode(), head["digest"].decode()
+    identity_text = content[head.end() : identity_end]
     body = b'{"identity":%b,"result":%b}' % (identity_text, content[result_start:result_end])
     if (
         bytes_digest(identity_text) != key
@@ -212,7 +213,7 @@ def _after(text: str, start: int, words: str) -> int:
     return start + len(words)
 
 
-def _sound(record: Record, key: str) -> bool:
+def _is_sound(record: Record, key: str) -> bool:
     """Return whether a record belongs to the key and is unchanged since it was written."""
     identity, result = canonical(record["identity"]), canonical(record["result"])  # once: a store has many records
     body = b'{"identity":%b,"result":%b}' % (identity, result)
@@ -235,8 +236,8 @@ def digests(result: StoredResult) -> Iterator[str]:
     return (content["digest"] for content in _objects(result))
 
 
-def naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
-    """Yield the records that contain the digest ``name``, starting with those written closest to ``written_s``.
+def find_naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
+    """Yield the records whose text contains the digest ``name``, those written closest to ``written_s`` (Unix time) first.
 
     A record is written just before its result is published, so few records are read.
     """

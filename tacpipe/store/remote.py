@@ -82,15 +82,16 @@ class RemoteStore:
         Raises `UsageError` as `check` does, and if the server creates an object that already exists.
         """
         if self.files.create(layout.MARK, layout.FORMAT.encode() + b"\n"):
-            self._expect_conditional()
+            self._require_conditional_writes()
         self.check()
 
-    def _expect_conditional(self) -> None:
-        tried = f"tmp/.{uuid.uuid4().hex}"
-        self.files.create(tried, b"1")
+    def _require_conditional_writes(self) -> None:
+        """Raise `UsageError` if the server replaces an existing object although the request forbids it."""
+        test_name = f"tmp/.{uuid.uuid4().hex}"
+        self.files.create(test_name, b"1")
         # the content differs, so that a lost response does not count as success
-        replaced = self.files.create(tried, b"2")
-        self.files.delete(tried)
+        replaced = self.files.create(test_name, b"2")
+        self.files.delete(test_name)
         if replaced:
             raise UsageError(
                 f"The server of {self.place} replaces existing objects although the request forbids it (If-None-Match: "
@@ -101,9 +102,9 @@ class RemoteStore:
 
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
-        """Protect the objects announced in the block, and ``manifests``, which the run reads, from collection.
+        """Protect ``manifests``, which the run reads, and the objects announced in the block from collection.
 
-        Raises `TacpipeError` after the block if a collection treated the announcement as that of a dead process.
+        Raises `TacpipeError` after the block if a collection mistook the run for a dead one.
         """
         self.prepare()
         self._manifests = sorted(manifests)
@@ -121,10 +122,10 @@ class RemoteStore:
             self._leases, self._announced = [], set()
 
     def announce(self, names: Iterable[str], *, manifests: Iterable[str] = (), keys: Iterable[str] = ()) -> None:
-        """Announce objects to collections, before checking that they exist.
+        """Protect objects from collections. Call it before checking that they exist.
 
-        ``manifests`` announce everything that they name, and ``keys`` everything that their records name once these
-        exist.
+        ``manifests`` also protects everything that they name, and ``keys`` everything that their records name once
+        these exist.
         """
         new = sorted(set(names) - self._announced)
         new_manifests, new_keys = sorted({*manifests} - {*self._manifests}), sorted(set(keys) - self._announced)
@@ -137,12 +138,12 @@ class RemoteStore:
         self._announced.update(new, new_keys)
 
     def runs(self) -> dict[str, tuple[Entry, Run]]:
-        """Return the current announcements with their entries, by name."""
+        """Return the announcement of each run, with the entry of its file, by file name."""
         runs = {}
         for entry in self.files.list("leases"):
             with contextlib.suppress(FileNotFoundError):  # the run has ended
                 content = self.files.read(entry.name, LEASE_BYTES)
-                runs[entry.name] = entry, leases.parsed(Path(entry.name), content)
+                runs[entry.name] = entry, leases.parse_lease(Path(entry.name), content)
         return runs
 
     def exclusively(self, key: str, work: str) -> contextlib.AbstractContextManager[None]:
@@ -161,7 +162,7 @@ class RemoteStore:
         return set(self._existing_entries("records", {layout.record_name(key): key for key in keys}))
 
     def _existing_entries(self, folder: str, names_by_path: Mapping[str, str]) -> dict[str, Entry]:
-        """Return the entries of the names (values) whose paths (keys) exist in a folder.
+        """Return the entries of the files in a folder that exist, by the values of ``names_by_path``; its keys are paths.
 
         The folder is listed while that costs no more than single requests; the remaining paths are requested one by
         one.
@@ -237,7 +238,10 @@ class RemoteStore:
             )
 
     def _stored_blocks(self, name: str, limit: int) -> Iterator[bytes]:
-        """Yield the content of an object, including one that a running or killed collection moved aside."""
+        """Yield the content of an object, including one that a running or killed collection moved aside.
+
+        Raises `AbsentError` if it does not exist.
+        """
         try:
             yield from self.files.blocks(layout.object_name(name), limit)
             return
@@ -326,14 +330,15 @@ class RemoteStore:
         return []
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
-        """Yield keys and their records, by default all; damaged records are skipped."""
-        if keys is None:
-            keys = [Path(entry.name).stem for entry in self.files.list("records")]
-        for key, record in threads.map_in_threads(self._record, keys, MAX_CONCURRENT):
+        """Yield keys and their records, by default all. Damaged records are skipped."""
+        all_keys = (Path(entry.name).stem for entry in self.files.list("records")) if keys is None else keys
+        for key, record in threads.map_in_threads(self._record, list(all_keys), MAX_CONCURRENT):
             if record is not None:
                 yield key, record
 
     def _record(self, key: str) -> tuple[str, Record | None]:
+        """Return ``key`` with its record, or with None if it is missing or damaged."""
+
         def parse(content: bytes) -> Record | None:
             with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 regular.expect_parsed(key, len(content))

@@ -11,7 +11,7 @@ from pathlib import Path
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import threads
 from tacpipe.store.backend import MAX_CONCURRENT, Backend, read_twice
-from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, RootProject, decoded, encoded, name_of, project_id, succeeding
+from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, RootProject, decoded, encoded, name_of, next_root, project_id
 
 _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 
@@ -71,18 +71,18 @@ class RemoteRoots:
         same = before is not None and before["manifest"] == manifest and before.get("project") == project
         if same and (output or is_snapshot):
             return True
-        root = succeeding(before, name, PUSHED, manifest, lasting=lasting)
+        root = next_root(before, name, PUSHED, manifest, lasting=lasting)
         root["project"] = project
         if before is not None and not is_snapshot and not lasting:
             root["history"] = [version for version in root["history"] if version["manifest"] != before["manifest"]]
         root["number"] = before.get("number", 0) if before is not None and _name(before) == _name(root) else 0
         if output:
             root["output"] = True
-        return self._succeed(root)
+        return self._create_next(root)
 
     def write(self, root: Root) -> None:
         """Write ``root`` as the successor of the version from `all`. Raises `TacpipeError` if another one came first."""
-        if not self._succeed(root):
+        if not self._create_next(root):
             raise TacpipeError(
                 f"{root['path']} was pushed to {self.files.place} meanwhile. Run the same command again."
             )
@@ -98,14 +98,14 @@ class RemoteRoots:
         """Return the names of versions that no push can still consider the newest: all but the last two of each root."""
         return [file for versions in self._versions().values() for _, file in versions[:-2]]
 
-    def _succeed(self, root: Root) -> bool:
+    def _create_next(self, root: Root) -> bool:
+        """Create the next version of a root; return False if another process created it first."""
         name = _name(root)
         number = root["number"] + 1
         if not self.files.create(_version(name, number), encoded(root)):
             return False
-        if (
-            number > 2
-        ):  # keeps the previous version, so that a process that read the deleted one cannot reuse its number
+        # the previous version stays, so that a process that read the deleted one cannot reuse its number
+        if number > 2:
             self.files.delete(_version(name, number - 2))
         return True
 
@@ -115,6 +115,7 @@ class RemoteRoots:
         return zip(newest, threads.map_in_threads(self._read_version, newest.values(), MAX_CONCURRENT), strict=True)
 
     def _read_version(self, version: tuple[int, str]) -> Root | None:
+        """Return the root in a version (number, file) with its number, or None if it is gone or damaged."""
         number, file = version
         with contextlib.suppress(FileNotFoundError):
             root = read_twice(self.files, file, ROOT_BYTES, _parse)
@@ -122,7 +123,10 @@ class RemoteRoots:
         return None
 
     def _versions(self, only: str = "") -> dict[str, list[tuple[int, str]]]:
-        """Return number and file of the versions of each root, the newest last; roots of a copied folder have number 0."""
+        """Return number and file of the versions of each root, or ``only`` of this one, the newest last.
+
+        Roots of a copied folder have number 0.
+        """
         versions: dict[str, list[tuple[int, str]]] = {}
         entries = list(self.files.list(f"roots/{only}" if only else "roots"))
         copied = self.files.stat(f"roots/{only}.json") if only and not entries else None

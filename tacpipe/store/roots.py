@@ -40,7 +40,7 @@ class WrittenManifest(TypedDict):
 class EarlierManifest(WrittenManifest):
     """A manifest that a path held before."""
 
-    lasting: bool  # it is remembered for ever
+    lasting: bool  # whether it is remembered forever
 
 
 class Root(WrittenManifest):
@@ -53,8 +53,8 @@ class Root(WrittenManifest):
     key: NotRequired[str]  # the run that produced the manifest, or the key of what was labelled
     pushed: NotRequired[list[str]]  # manifests of this path that went to other stores, newest first
     project: NotRequired[RootProject]
-    missing_since_s: NotRequired[int]  # when the path was first out of reach
-    output: NotRequired[bool]  # a command wrote it, with the bucket as its store
+    missing_since_s: NotRequired[int]  # time when the path first could not be reached
+    output: NotRequired[bool]  # whether a command wrote it with the bucket as its store
     number: NotRequired[int]  # version that it was read from in a store without locks; it is not stored
 
 
@@ -72,7 +72,7 @@ class Roots:
         kind, name = self.kind_and_name(path)
         current = self.get(path)
         if current is None or current["manifest"] != manifest:
-            root = succeeding(current, name, kind, manifest, lasting=lasting)
+            root = next_root(current, name, kind, manifest, lasting=lasting)
             if current and "pushed" in current:
                 root["pushed"] = current["pushed"]
             if key:
@@ -83,22 +83,22 @@ class Roots:
 
     def get(self, path: Path) -> Root | None:
         """Return the root of ``path``, or None if there is none. Its ``path`` is the dataset's present location."""
-        return self.at(self._file(*self.kind_and_name(path)))
+        return self.read(self._file(*self.kind_and_name(path)))
 
     def push(self, name: str, project: RootProject, manifest: str, before: Root | None, *, lasting: bool) -> bool:
-        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``.
+        """Record that a project pushed ``manifest`` as its dataset ``name``, after ``before``. Return True.
 
-        What was pushed before it stays in the history, for ever where that is ``lasting``. Returns True: a lease sees to it
-        that nobody else pushes that name at the same time.
+        Previous versions stay in the history, forever if ``lasting``. A lease prevents concurrent pushes of the same
+        name.
         """
         if before is None or before["manifest"] != manifest or before.get("project") != project:
-            self.write({**succeeding(before, name, PUSHED, manifest, lasting=lasting), "project": project})
+            self.write({**next_root(before, name, PUSHED, manifest, lasting=lasting), "project": project})
         self.store.sync(self._file(PUSHED, name, project["id"]))
         return True
 
     def pushed(self, name: str, project: str) -> Root | None:
         """Return the root that the project with this id pushed as ``name``, or None."""
-        return self.at(self._file(PUSHED, name, project))
+        return self.read(self._file(PUSHED, name, project))
 
     def note_pushed(self, path: Path, manifest: str) -> None:
         """Record that ``manifest`` of ``path`` was pushed to another store. Does nothing for a path without a root."""
@@ -109,13 +109,13 @@ class Roots:
 
     def all(self) -> list[Root]:
         """Return all roots. Damaged ones are quarantined; the next run of their stage writes them again."""
-        roots = (self.at(path) for path in self.store.listed("roots", "*.json"))
+        roots = (self.read(path) for path in self.store.listed("roots", "*.json"))
         return [root for root in roots if root is not None]
 
     def remove(self, root: Root) -> None:
         """Remove a root returned by `all`, whatever the name of its file."""
         for file in self.store.listed("roots", "*.json"):
-            if self.at(file) == root:
+            if self.read(file) == root:
                 with readable_errors(self.store.root):
                     file.unlink(missing_ok=True)
 
@@ -126,8 +126,8 @@ class Roots:
             name = os.path.relpath(name, self.store.root.parent)
         self.store.write_file(self._file(kind, name, project_id(root)), encoded({**root, "path": name, "kind": kind}))
 
-    def at(self, file: Path) -> Root | None:
-        """Return the root in ``file``, or None if it does not exist or is damaged. A damaged one is quarantined."""
+    def read(self, file: Path) -> Root | None:
+        """Return the root in ``file``, or None if it does not exist or is damaged. A damaged file is quarantined."""
         try:
             with readable_errors(self.store.root, reading=True):
                 value = regular.json_value(file, ROOT_BYTES)
@@ -164,7 +164,10 @@ class Roots:
             return False
 
     def kind_and_name(self, path: Path) -> tuple[str, str]:
-        """Return kind and name of a root: a relative path if the dataset is next to its store, so that both can be moved."""
+        """Return kind and name of the root of a path.
+
+        The name of a dataset next to its store is a relative path, so that both can be moved together.
+        """
         parent = self.store.root.parent
         if self.store.root.name == BESIDE_NAME and path.is_relative_to(parent):
             return BESIDE, str(path.relative_to(parent))
@@ -198,8 +201,8 @@ def project_id(root: Root) -> str:
     return root["project"]["id"] if "project" in root else ""
 
 
-def succeeding(current: Root | None, path: str, kind: str, manifest: str, *, lasting: bool) -> Root:
-    """Return the root for ``manifest``, whose history begins with the manifest of ``current``."""
+def next_root(current: Root | None, path: str, kind: str, manifest: str, *, lasting: bool) -> Root:
+    """Return a new root for ``manifest``, whose history starts with the manifest of ``current``."""
     return {
         "path": path,
         "kind": kind,

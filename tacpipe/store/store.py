@@ -164,6 +164,10 @@ class Store:
         return self._exists(name, size)
 
     def _exists(self, name: str, size: int | None = None) -> bool:
+        """Return whether an object exists and has this size in bytes; one that a collection moved aside is put back.
+
+        A path that is not a regular file is quarantined.
+        """
         try:
             entry = self.files.stat(layout.object_name(name))
         except regular.IrregularError:
@@ -234,9 +238,9 @@ class Store:
 
     def settle(self, names: Iterable[str]) -> None:
         """Make names in the store survive a power loss, as their contents do; each folder is synced once."""
-        above = {str(folder) for name in names for folder in Path(name).parents}
+        folders = {str(folder) for name in names for folder in Path(name).parents}
         with readable_errors(self.root):
-            for folder in sorted(above, reverse=True):  # subfolders first
+            for folder in sorted(folders, reverse=True):  # subfolders first
                 sync_folder(self.files.path(folder))
 
     def read(self, name: str, size: int | None = None) -> bytes:
@@ -249,6 +253,7 @@ class Store:
         return self._read(name, size)
 
     def _read(self, name: str, size: int | None = None) -> bytes:
+        """Implement `read`."""
         try:
             content = self.files.read(layout.object_name(name), None if size is None else read_limit(size))
         except FileNotFoundError:
@@ -314,7 +319,7 @@ class Store:
         return f"{self._root}/tmp/{layout.ASIDE}{name}"
 
     def _put_back(self, name: str) -> bool:
-        """Put an object that a running or killed collection moved aside back in place; return whether there was one.
+        """Put back an object that a running or killed collection moved aside; return whether there was one.
 
         Raises `StorageError` if it cannot be put back, because it is not lost.
         """
@@ -334,7 +339,10 @@ class Store:
             sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
 
     def listed(self, *patterns: str) -> list[Path]:
-        """Return the paths that match one pattern per level. Raises `TacpipeError` for folders that cannot be listed."""
+        """Return the paths that match one pattern per folder level.
+
+        Raises `TacpipeError` for folders that cannot be listed.
+        """
         paths = [self.root]
         with readable_errors(self.root):
             for pattern in patterns:
@@ -396,7 +404,7 @@ class Store:
     ) -> Record:
         """Record ``result`` for ``identity`` and return the valid record; the first of several processes wins.
 
-        ``replace`` is for results whose existing record names missing objects.
+        With ``replace``, an existing record, which names missing objects, is replaced.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)

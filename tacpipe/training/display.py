@@ -19,8 +19,8 @@ _KEY_LENGTH = 8  # characters of a key to show, enough for a shell to complete
 def followers_on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
     """Yield the followers that show the trainings of a stage in ``workspace``; an empty list if output is suppressed.
 
-    Without a workspace, no path is shown, because it is on another computer. On a terminal, a bar is animated from the
-    start to the end of the block, also before the first epoch and after the last.
+    Without a workspace, which is then on another computer, no path is shown. On a terminal, a bar is animated during
+    the whole block, also before the first epoch and after the last.
     """
     if terminal.is_quiet():
         yield []
@@ -87,7 +87,10 @@ class _EpochReport:
         return f"{self.network.name}: " if self.network.name else ""
 
     def remaining_time(self, passed: float = 0.0) -> str:
-        """Return the estimated time for all remaining epochs; early stopping may shorten it."""
+        """Return the estimated time for all remaining epochs, or "" before the first batch.
+
+        ``passed`` is the fraction of the current epoch. Early stopping may shorten the time.
+        """
         trained_epochs = len(self.history) - self._resumed + passed
         if not trained_epochs:
             return ""
@@ -106,7 +109,7 @@ class EpochLines(_EpochReport):
         self._last_line_s = self._start_s
 
     def line(self, line: Line, learning_rate: float) -> None:
-        """Print the losses, the best so far, the epoch's duration and the remaining time."""
+        """Print the line of an epoch: the losses, the best so far, the epoch's duration and the remaining time."""
         super().line(line, learning_rate)
         now_s = time.monotonic()
         epoch_s, self._last_line_s = now_s - self._last_line_s, now_s
@@ -178,7 +181,6 @@ class Bar(_EpochReport):
 
 def _shorten_path(path: Path) -> str:
     """Return a path relative to the working directory if it is inside, with folders named by a key shortened to a glob."""
-    with contextlib.suppress(ValueError):
-        path = path.relative_to(Path.cwd())
-    parts = [f"{part[:_KEY_LENGTH]}*" if len(part) == _DIGEST else part for part in path.parts]
+    shown = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    parts = [f"{part[:_KEY_LENGTH]}*" if len(part) == _DIGEST else part for part in shown.parts]
     return str(Path(*parts))

@@ -136,8 +136,8 @@ def trackers() -> tuple[Follower, ...]:
 
 
 @contextlib.contextmanager
-def network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Followers]:
-    """Yield the followers of a network that is trained in the block."""
+def follow_network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Followers]:
+    """Tell the followers that a network is trained in the block, and yield them; report afterwards whether it finished."""
     followers, trained = _current.get(), False
     for follower in followers:
         follower.begin(described, history)
@@ -151,7 +151,7 @@ def network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Foll
 
 @contextlib.contextmanager
 def announce_resume(network: TrainedNetwork, epochs_trained: int) -> Iterator[None]:
-    """Let the message for an interrupt in the block contain the epoch from which the same command resumes."""
+    """If the block is interrupted, print the epoch from which the same command resumes."""
     name = f" of {network.name}" if network.name else ""
     epoch = f"epoch {epochs_trained + 1} of {network.epochs}"
     sentence = f"tacpipe: interrupted; the same command resumes training{name} from {epoch}."
@@ -172,6 +172,7 @@ class _HistoryFile:
         self._failed = False
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
+        """Open the history file, unless an earlier network did, and write the lines of a resumed training."""
         self._labels = network.labels
         if self._handle is None and not self._failed:
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -202,6 +203,7 @@ class _HistoryFile:
 
     @contextlib.contextmanager
     def _tolerate_errors(self) -> Iterator[None]:
+        """Report the first error of writing the file, and let the training continue without it."""
         try:
             yield
         except OSError as error:
@@ -244,7 +246,12 @@ class Sender:
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         """Send the network, and its epochs before an interruption."""
-        fields = NetworkFields(epochs=network.epochs, number=network.number, count=network.count, labels=network.labels)
+        fields = NetworkFields(
+            epochs=network.epochs,
+            number=network.number,
+            count=network.count,
+            labels=network.labels,
+        )
         self._send({"begin": fields, "history": list(history)})
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
@@ -275,7 +282,7 @@ class Receiver:
         self._epochs = 0  # epochs of the network that the followers have received
 
     def take(self, message: TrainingMessage) -> None:
-        """Call the followers with the content of a message."""
+        """Call the followers for a message of `Sender`."""
         if "begin" in message:
             self._begin(TrainedNetwork(**message["begin"]), message["history"])
         elif "batch" in message:
@@ -292,6 +299,7 @@ class Receiver:
             self._end(trained=False)
 
     def _begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
+        """Start a network; if it is already followed, only add the lines that are new."""
         if network == self._network:
             for line in history:
                 self._line(line, 0.0)
@@ -301,6 +309,7 @@ class Receiver:
             follower.begin(network, history)
 
     def _line(self, line: Line, learning_rate: float) -> None:
+        """Pass a line to the followers, unless it has been passed before."""
         if line["epoch"] <= self._epochs:
             return
         self._epochs = line["epoch"]

@@ -90,6 +90,7 @@ class Adam:
         }
 
     def _moments(self, number: int) -> dict[str, Tensor]:
+        """Return the state of the weight ``number``, which is zero before its first update."""
         if number not in self._state:
             weight = self.weights[number]
             self._state[number] = {
@@ -122,7 +123,10 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Seque
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], list[Line]] | None:
-    """Return the tensors and history of the checkpoint in ``folder``, or None if it does not exist or is damaged."""
+    """Return the tensors and history of the checkpoint in ``folder``, or None if it does not exist or is damaged.
+
+    Logs a warning for a damaged checkpoint.
+    """
     path = folder / FILE
     try:
         signed = regular.content(path, follow=False)
@@ -230,6 +234,7 @@ class _TrainingState:
     history: list[Line]
 
     def save(self, folder: Path) -> None:
+        """Save the model, its best weights, the state of Adam, the random generator and the history to a checkpoint."""
         slots = self.optimiser.state()
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
@@ -238,6 +243,7 @@ class _TrainingState:
         write_checkpoint(folder, tensors, self.history)
 
     def resume(self, folder: Path) -> None:
+        """Restore the state of a checkpoint, if there is one in ``folder``."""
         saved = read_checkpoint(folder)
         if saved is None:
             return
@@ -295,7 +301,7 @@ def _train_epochs(
 ) -> None:
     """Train all remaining epochs and report each to the followers."""
     random = torch.get_rng_state()
-    with following.network(network, list(run.history)) as followers:
+    with following.follow_network(network, list(run.history)) as followers:
         torch.set_rng_state(random)  # undo what followers drew
         while not run.is_finished(schedule):
             epochs_trained = len(run.history)
@@ -307,7 +313,10 @@ def _train_epochs(
 
 
 def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, followers: Followers) -> Line:
-    """Train for one epoch, append its line to the history and return it."""
+    """Train for one epoch, append its line to the history and return it.
+
+    The parts of the model that improved are copied to the best weights. Raises `TacpipeError` if a loss is not finite.
+    """
     run.model.train()
     epoch = len(run.history)
     total: Tensor | float = 0.0
@@ -328,8 +337,8 @@ def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, fo
         followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
     with torch.no_grad():
-        watched = work.watch(run.model)
-    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}  # type: ignore[typeddict-item]  # no labels
+        validated = work.watch(run.model)
+    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **validated}  # type: ignore[typeddict-item]  # no labels
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
@@ -361,7 +370,7 @@ def _mean(total: Tensor | float, count: int) -> float:
 def _improved_parts(
     ranks: Mapping[str, Sequence[float]], ranks_before: Iterable[Mapping[str, Sequence[float]]]
 ) -> list[str]:
-    """Return the parts of the model that are better than in all earlier epochs."""
+    """Return the parts of the model whose rank is lower than in all earlier epochs."""
     earlier = list(ranks_before)
     return [part for part, rank in ranks.items() if all(tuple(rank) < tuple(old[part]) for old in earlier)]
 

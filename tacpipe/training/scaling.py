@@ -79,11 +79,10 @@ class Affine:
 
         Raises `TacpipeError` if a logarithm is undefined (-1 or less).
         """
-        if self.logarithm:
-            if (values <= -1).any():
-                raise TacpipeError(f"The logarithm of 1 + {values.min():g} is not defined. Choose another scaling.")
-            values = np.log1p(values)
-        return ((values - self.offset) / self.scale).astype(np.float32)
+        if self.logarithm and (values <= -1).any():
+            raise TacpipeError(f"The logarithm of 1 + {values.min():g} is not defined. Choose another scaling.")
+        linear = np.log1p(values) if self.logarithm else values
+        return ((linear - self.offset) / self.scale).astype(np.float32)
 
     def restore(self, scaled: Floats) -> Floats:
         """Reverse `apply`: return scaled values (…, channel) in their own unit, as float64."""

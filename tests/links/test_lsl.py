@@ -219,7 +219,9 @@ def test_a_description_among_packets_is_recognised_with_its_options() -> None:
         + "".join(f"<channel><label>F{axis}</label><unit>newtons</unit></channel>" for axis in "xyz")
         + "</channels></desc></info>"
     )
-    packets = [lsl.packet(np.full((1, 3), row, dtype=np.float32), np.array([row / 200]), math.nan) for row in range(50)]
+    packets = [
+        lsl.pack_samples(np.full((1, 3), row, dtype=np.float32), np.array([row / 200]), math.nan) for row in range(50)
+    ]
     data = Chunks.from_pairs(
         [(0, lsl.DESCRIPTION + text.encode()), *((row * 5_000_000, packet) for row, packet in enumerate(packets))]
     )

@@ -24,9 +24,9 @@ def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
 @pytest.mark.parametrize(("arrived_ns", "waits"), [(ROW_NS - 1, True), (ROW_NS, True), (ROW_NS + 1, False)])
 def test_a_row_waits_for_what_arrived_by_then(arrived_ns: int, waits: bool) -> None:
     decoder, packets = decoder_and_packets("xela")
-    assert not decoder.may_hold(ROW_NS)
+    assert not decoder.may_contain(ROW_NS)
     decoder.take(Chunks.from_pairs([(arrived_ns, packets[0]), (ROW_NS + 5, packets[1])]))
-    assert decoder.may_hold(ROW_NS) == waits
+    assert decoder.may_contain(ROW_NS) == waits
 
 
 def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
@@ -35,9 +35,9 @@ def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
     cut = len(pieces[0]) // 2
     decoder.take(Chunks.from_pairs([(ROW_NS - 1, data[:cut])]))
     assert decoder.batches() == []
-    assert not decoder.may_hold(ROW_NS)  # nothing more came
+    assert not decoder.may_contain(ROW_NS)  # nothing more came
     decoder.take(Chunks.from_pairs([(ROW_NS + 1, data[cut:])]))
-    assert decoder.may_hold(ROW_NS)
+    assert decoder.may_contain(ROW_NS)
     stamps = np.concatenate([batch.t_ns for batch in decoder.batches()])
     assert stamps[0] <= ROW_NS + 1
 
@@ -45,4 +45,4 @@ def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
 def test_a_row_waits_for_what_a_lost_link_leaves() -> None:
     decoder, _ = decoder_and_packets("xela")
     decoder.take(StreamNote(ROW_NS + 1, "stream", LOST))
-    assert decoder.may_hold(ROW_NS)
+    assert decoder.may_contain(ROW_NS)

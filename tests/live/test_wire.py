@@ -69,7 +69,7 @@ def test_what_the_socket_does_not_take_waits_and_loses_no_byte(pair: Pair) -> No
 
 
 def test_a_queue_that_is_full_is_thrown_away_counted_and_reported_to_the_model(pair: Pair) -> None:
-    tap, blocks = RecorderTap(["a"], most_bytes=200_000), wire.Blocks(["a"])
+    tap, blocks = RecorderTap(["a"], max_bytes=200_000), wire.Blocks(["a"])
     tap.connect(pair[0])
     for number in range(400):
         tap.put("a", chunk(number, 5000))

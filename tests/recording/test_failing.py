@@ -249,7 +249,7 @@ def test_a_rig_file_that_is_wrong_is_refused_with_its_place(text: str, message: 
 def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with open(os.devnull) as devnull:
         monkeypatch.setattr("sys.stdin", devnull)
-        with triggers.keys() as pressed:
+        with triggers.watch_keys() as pressed:
             assert pressed() is False
             with pytest.raises(UsageError):
                 pressed(must=True)

@@ -194,7 +194,7 @@ def test_a_spool_that_is_being_sealed_is_left_to_the_process_that_does_it(
     real = appending.append
 
     def append(store: store_of.Store, *args: Any) -> str:
-        observed.append((live.spools(lab.folder), spool_folders.abandoned(store.root)))
+        observed.append((live.spools(lab.folder), spool_folders.find_abandoned(store.root)))
         return real(store, *args)
 
     monkeypatch.setattr(appending, "append", append)

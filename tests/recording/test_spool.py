@@ -138,9 +138,9 @@ def test_one_stream_is_read_alone(tmp_path: Path) -> None:
 
 def test_a_spool_that_is_written_is_not_abandoned_and_one_of_a_killed_process_is(tmp_path: Path) -> None:
     spool = Spool(tmp_path, HEADER, STREAMS)
-    assert spool_folders.abandoned(tmp_path) == []
+    assert spool_folders.find_abandoned(tmp_path) == []
     spool.close()
-    assert spool_folders.abandoned(tmp_path) == [spool.folder]
+    assert spool_folders.find_abandoned(tmp_path) == [spool.folder]
     program = f"""
 import time
 from pathlib import Path
@@ -157,12 +157,12 @@ time.sleep(60)
     child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert child.stdout is not None
     child.stdout.readline()
-    assert len(spool_folders.abandoned(tmp_path)) == 1
+    assert len(spool_folders.find_abandoned(tmp_path)) == 1
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
     child.stdout.close()
 
-    folder = next(path for path in spool_folders.abandoned(tmp_path) if path != spool.folder)
+    folder = next(path for path in spool_folders.find_abandoned(tmp_path) if path != spool.folder)
     read = Spooled(folder)
 
     assert pairs(list(read.blocks())) == [("a", 1, b"one"), ("a", 2, b"two")]

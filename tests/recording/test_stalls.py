@@ -160,10 +160,10 @@ def test_a_device_that_takes_its_time_is_no_stall() -> None:
     pace = Pace(0, 0)
     now_ns = 0
     for waited_ns in (READ_NS, 10 * MS, READ_NS + STALL_NS // 2):
-        assert pace.read(now_ns, now_ns + waited_ns, READ_NS, 0) is None
+        assert pace.add_read(now_ns, now_ns + waited_ns, READ_NS, 0) is None
         now_ns += waited_ns
     pace.resume(now_ns + 5 * S)  # it was tared meanwhile
-    assert pace.read(now_ns + 5 * S, now_ns + 5 * S + MS, READ_NS, 0) is None
+    assert pace.add_read(now_ns + 5 * S, now_ns + 5 * S + MS, READ_NS, 0) is None
 
 
 def test_a_datagram_says_whether_the_kernel_stamped_it() -> None:

@@ -159,8 +159,8 @@ def test_tables_that_contradict_themselves_make_no_frame(place: int, value: int)
     broken = bytearray(BY_HAND)
     broken[place] = value
     broken[-6:-4] = (sum(broken[4:-6]) & 0xFFFF).to_bytes(2, "little")
-    assert not pts.are_whole(np.frombuffer(bytes(broken), np.uint8)[None])[0]
-    assert pts.are_whole(np.frombuffer(BY_HAND, np.uint8)[None])[0]
+    assert not pts.are_valid(np.frombuffer(bytes(broken), np.uint8)[None])[0]
+    assert pts.are_valid(np.frombuffer(BY_HAND, np.uint8)[None])[0]
 
 
 def test_frames_of_two_layouts_in_one_batch_are_told_apart() -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
-from tacpipe.store.addresses import parsed
+from tacpipe.store.addresses import parse_address
 from tacpipe.store.backend import Backend, Directory
 from tacpipe.store.bucket import Bucket
 
@@ -53,7 +53,7 @@ def folder(root: Path) -> Place:
 
 def bucket(address: str) -> Place:
     """Return a store in a bucket, at the server that the environment names."""
-    parsed_address = parsed(address)
+    parsed_address = parse_address(address)
     assert not isinstance(parsed_address, Path)
     return Place(address, Bucket(parsed_address))
 

@@ -20,7 +20,7 @@ from tacpipe.engine.keys import Done, WorkerTask, identity
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location, records
-from tacpipe.store.addresses import BucketAddress, parsed
+from tacpipe.store.addresses import BucketAddress, parse_address
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.cached import CachedStore
 from tacpipe.store.remote import RemoteStore
@@ -280,7 +280,7 @@ def test_copies_are_cleared_of_a_bucket_alone(lab: Lab) -> None:
 def test_each_address_and_server_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def folder(address: str, endpoint: str = "") -> Path:
         monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
-        parsed_address = parsed(address)
+        parsed_address = parse_address(address)
         assert isinstance(parsed_address, BucketAddress)
         return cached.folder(parsed_address)
 

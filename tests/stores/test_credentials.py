@@ -55,7 +55,7 @@ def test_a_profile_that_is_not_there_and_a_file_that_is_none_are_refused_without
 )  # fmt: skip
 def test_addresses_with_credentials_or_of_other_forms_are_refused_without_showing_them(address: str) -> None:
     with pytest.raises(UsageError) as refused:
-        addresses.parsed(address)
+        addresses.parse_address(address)
     assert SECRET not in str(refused.value)
 
 
@@ -104,7 +104,7 @@ def test_a_real_server_refuses_a_wrong_secret_and_the_sentence_shows_neither(
 
 
 def test_the_account_of_an_address_of_azure_is_a_setting_and_the_container_is_the_first_folder() -> None:
-    address = addresses.parsed("az://account/container/touch/store")
+    address = addresses.parse_address("az://account/container/touch/store")
     assert isinstance(address, addresses.BucketAddress)
     resolved = addresses.settings(address, {})
     assert (resolved.config["account_name"], resolved.url) == ("account", "az://container/touch/store")

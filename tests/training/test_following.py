@@ -160,7 +160,7 @@ def test_a_file_that_cannot_be_written_is_reported_once_and_ends_no_training(
     (tmp_path / "full").mkdir()
     with monkeypatch.context() as patch, following.in_workspace(tmp_path / "full"):
         patch.setattr(os, "write", full)
-        with following.network(TrainedNetwork(2), []) as followers:
+        with following.follow_network(TrainedNetwork(2), []) as followers:
             for epoch in (1, 2):
                 followers.line({"epoch": epoch, "train_loss": 1.0, "val_loss": 0.5}, 0.1)
     assert capsys.readouterr().err.count("No space left") == 1

@@ -33,7 +33,7 @@ from tacpipe.io import terminal, termination
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras, registry
 from tacpipe.store import records
-from tacpipe.store.location import opened
+from tacpipe.store.location import open_store
 from tacpipe.store.store import Store
 from tacpipe.training import following
 
@@ -151,7 +151,7 @@ class Dask:
             ),
         ):
             futures = [self.client.submit(_work, versions, compute, chunk, topic, pure=False) for chunk in task_chunks]
-            store = opened(tasks[0].store, tasks[0].run)
+            store = open_store(tasks[0].store, tasks[0].run)
             try:
                 for result in self._results(futures, tasks[0].name):
                     if result.record is not None:  # the worker announces it too, but only until the worker ends
@@ -187,6 +187,7 @@ class Dask:
                 thread.join()
 
     def _workers(self) -> Collection[str]:
+        """Return the addresses of the workers. Raises `TacpipeError` if there is none."""
         workers: Collection[str] = self.client.scheduler_info(n_workers=-1)["workers"]
         if not workers:
             raise TacpipeError(
@@ -196,6 +197,7 @@ class Dask:
         return workers
 
     def _results(self, futures: Sequence[Future[Any]], stage: str) -> Iterator[Done]:
+        """Yield the results of each chunk when it is finished. Raises the errors of `run`."""
         from concurrent.futures import CancelledError
 
         from distributed import as_completed
@@ -265,6 +267,10 @@ def _start_workers(workers: int) -> Iterator[Dask]:
 
 @contextlib.contextmanager
 def _client(address: str) -> Iterator[Client]:
+    """Yield a client of the scheduler at ``address`` (``protocol://host:port``).
+
+    Raises `UsageError` if the address is invalid, `TacpipeError` if no scheduler responds.
+    """
     host, _, port = address.partition("://")[2].rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise UsageError(f"{address} is not the address of a scheduler; it needs host and port, as localhost:8786.")
@@ -350,13 +356,14 @@ def _work(
 
 
 def _check(name: str, versions: Mapping[str, str], task: WorkerTask) -> None:
+    """Raise an error if this worker would compute other results, or does not reach the store of the client."""
     differences = unlike(versions, local_versions(task.name))
     if differences:
         raise UsageError(
             f"Worker {name} would compute other results than this computer: {'; '.join(differences)}. Install the "
             f"same there."
         )
-    store = opened(task.store)
+    store = open_store(task.store)
     if store.distant:  # opened by its address, with this worker's own credentials
         try:
             store.record(digest(task.identity))
@@ -380,17 +387,17 @@ def _lease(task: WorkerTask) -> str:
     Two computers never write to one lease, because on a network file system one would overwrite the other's entries. In
     a bucket the client has announced the keys, so no lease is needed.
     """
-    if opened(task.store).distant:
+    if open_store(task.store).distant:
         return ""
     if not task.run or task.run in _leases:
         return _leases.get(task.run, "")
     lease_paths: Queue[str] = Queue()
-    threading.Thread(target=_keep, args=(Store(task.store), task.run, lease_paths), daemon=True).start()
+    threading.Thread(target=_hold_lease, args=(Store(task.store), task.run, lease_paths), daemon=True).start()
     _leases[task.run] = lease_paths.get()
     return _leases[task.run]
 
 
-def _keep(store: Store, run: str, lease_paths: Queue[str]) -> None:
+def _hold_lease(store: Store, run: str, lease_paths: Queue[str]) -> None:
     """Hold a lease until a run has ended. Puts the lease's path into ``lease_paths``."""
     run_ended = threading.Event()
     with store.leases.running() as announcing:

@@ -139,6 +139,7 @@ def connected(address: str, jobs: int) -> Iterator[Local]:
 
 
 def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
+    """Yield the results of all tasks, computed by ``jobs`` worker processes. Raises the errors of `Local.run`."""
     from multiprocessing.connection import wait  # takes 10 ms that a cache hit should not pay
 
     pending = divide_into_chunks(tasks, jobs)
@@ -170,7 +171,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
         alive, life = server.Pipe(duplex=False)
         workers[ours] = life
         # a worker that received half of a task would report an error
-        with termination.deferred(), _death_told(), without_main():
+        with termination.deferred(), _explain_death(), without_main():
             server.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
         theirs.close()
         alive.close()
@@ -189,12 +190,13 @@ def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> No
 
 
 def _give(worker: Connection, compute: Callable[[Task], Done], chunk: Sequence[Task]) -> None:
-    with _death_told():
+    with _explain_death():
         worker.send((compute, chunk))
 
 
 def _receive(worker: Connection) -> list[Any]:
-    with _death_told():
+    """Return the results of a chunk. Raises the error of its stage, and `TacpipeError` if the worker died."""
+    with _explain_death():
         results: list[Any] | Exception = worker.recv()
     if isinstance(results, Exception):
         raise results
@@ -202,7 +204,8 @@ def _receive(worker: Connection) -> list[Any]:
 
 
 @contextlib.contextmanager
-def _death_told() -> Iterator[None]:
+def _explain_death() -> Iterator[None]:
+    """Raise `TacpipeError` with advice if the connection to a worker breaks in the block."""
     try:
         yield
     except (EOFError, OSError) as error:

@@ -101,7 +101,10 @@ def _create_certificate(folder: Path) -> Security:
 
 @contextlib.contextmanager
 def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
-    """Submit the jobs, and cancel them at the end of the block."""
+    """Submit ``jobs`` jobs, yield their cluster, and cancel them at the end of the block.
+
+    Raises `TacpipeError` if there is no ``sbatch`` or Slurm refuses a job.
+    """
     from dask_jobqueue import SLURMCluster
 
     def configured(name: str, default: Any) -> Any:

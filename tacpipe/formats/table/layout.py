@@ -265,7 +265,7 @@ def layout_from_tables(tables: Values, place: str = "The layout", container: For
         _parse_attributes(tables.get("attributes", {}), place),
     )
     words = _expect_table(tables.get("vocabulary", {}), place, "vocabulary")
-    _expect_known_words(layout, fields.filled(Vocabulary, words, f"{place}, [vocabulary]", "entry"), place)
+    _expect_known_words(layout, fields.build_dataclass(Vocabulary, words, f"{place}, [vocabulary]", "entry"), place)
     with_files = [value.name for value in layout.streams if value.files]
     if with_files and len(with_files) < len(layout.streams):
         raise UsageError(
@@ -333,14 +333,14 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
         _parse_column(column, f"{place}, columns {number}") for number, column in enumerate(columns, 1)
     )
     if "long" in values:
-        values["long"] = fields.filled(
+        values["long"] = fields.build_dataclass(
             LongColumns, _expect_table(values["long"], place, "long"), f"{place}, long", "entry"
         )
     if isinstance(values.get("header"), list):
         values["names"], values["header"] = values["header"], False
     if "missing" in values and isinstance(values["missing"], list):
         values["missing"] = tuple(values["missing"])
-    stream: StreamLayout = fields.filled(StreamLayout, {"name": name, **values}, place, "entry")
+    stream: StreamLayout = fields.build_dataclass(StreamLayout, {"name": name, **values}, place, "entry")
     if len(stream.separator) > 1:
         raise UsageError(f"{place}: separator is {excerpt(stream.separator)}; it must be one character.")
     if stream.separator and stream.separator == stream.decimal:
@@ -438,7 +438,7 @@ def _expect_camera(values: Values, place: str, camera: str) -> None:
 
 def _parse_time(table: Any, stream_place: str) -> Time:
     place = f"{stream_place}, time"
-    time: Time = fields.filled(Time, _expect_table(table, stream_place, "time"), place, "entry")
+    time: Time = fields.build_dataclass(Time, _expect_table(table, stream_place, "time"), place, "entry")
     if bool(time.column or time.file) == (time.rate_hz is not None):
         raise UsageError(f"{place}: give either the column or the file with the stamps, or rate_hz.")
     if time.format:
@@ -454,7 +454,7 @@ def _parse_column(value: Any, place: str) -> ColumnRule:
     values = dict(_expect_table(value, place, ""))
     if "about" in values:
         values["about"] = tuple(sorted(_expect_table(values["about"], place, "about").items()))
-    column: ColumnRule = fields.filled(ColumnRule, values, place, "entry")
+    column: ColumnRule = fields.build_dataclass(ColumnRule, values, place, "entry")
     places = ("taxel", "axis") if column.shape else ()
     pattern.fill_pattern(column.name, dict.fromkeys((*pattern.placeholders(column.match), *places), "x"))
     if column.axes and (not column.shape or len(column.axes) not in (column.shape[-1], column.shape[0])):
@@ -471,7 +471,7 @@ def _parse_labels(value: Any, place: str) -> LabelSource:
     values = dict(_expect_table(value, place, ""))
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
-    labels: LabelSource = fields.filled(LabelSource, values, place, "entry")
+    labels: LabelSource = fields.build_dataclass(LabelSource, values, place, "entry")
     is_tree = labels.file.lower().endswith(TREES)  # names in a YAML or JSON file are recording names
     if not pattern.placeholders(labels.file) and not labels.key and not is_tree:
         raise UsageError(

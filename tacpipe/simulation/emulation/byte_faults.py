@@ -136,7 +136,7 @@ def parse(text: str) -> Faults:
             values[name.strip()] = float(value)
         except ValueError:
             raise UsageError(f"--faults: {part!r} is not a fault; write NAME=NUMBER, such as noise=0.5.") from None
-    faults: Faults = params.filled(Faults, values, "--faults", "fault")
+    faults: Faults = params.build_dataclass(Faults, values, "--faults", "fault")
     return faults
 
 

@@ -277,7 +277,7 @@ def has_points(sensor: Sensor) -> bool:
 def frame_pace(rig: Rig, name: str) -> FramePace:
     """Return the pace of a stream from ``emulate`` in the rig file. Keys of the stream override those of the rig."""
     source = f"stream {name}, emulate"
-    pace: FramePace = params.filled(FramePace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
+    pace: FramePace = params.build_dataclass(FramePace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
     return pace
 
 

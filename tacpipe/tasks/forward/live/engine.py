@@ -232,7 +232,7 @@ class ForecastEngine(Engine):
     def _decode(self, offset_ns: int, until_ns: int | None) -> None:
         """Decode new bytes and pass them to the chain; if a row is due, only those with samples up to ``until_ns``."""
         for name, decoder in self._decoders.items():
-            if until_ns is None or decoder.may_hold(until_ns):
+            if until_ns is None or decoder.may_contain(until_ns):
                 for batch in decoder.batches():
                     self.chain.push(name, decoder.columns(batch, offset_ns))
 

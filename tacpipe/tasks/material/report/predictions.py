@@ -100,7 +100,7 @@ def _counted_slides(table: pa.Table, config: MaterialConfig, naming: Naming) -> 
     """Return a mask (slide,) of the rows to evaluate."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)
-    settings = params_of.counting(registry.load("train.material"), config.get("params", {}))
+    settings = params_of.used_params(registry.load("train.material"), config.get("params", {}))
     mask: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
     mask &= sensors != str(settings.get("frozen_sensor", ""))
     for sensor, held_out in config.get("held_out", {}).items():
