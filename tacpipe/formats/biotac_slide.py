@@ -34,8 +34,8 @@ ARM = {  # stream and columns by file name suffix
 def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Return the files of each slide below ``source`` by recording name, such as ``biotac-m03-t007`` for ``mat3_7_…``.
 
-    Each finger file is a slide; arm files without one are ignored. Raises `TacpipeError` if ``source`` is not a folder,
-    contains no slide, or contains one twice.
+    Each finger file is a slide; arm files without one are ignored. Raises `TacpipeError` if ``source`` is not a folder
+    or contains no slide, and `UsageError` if it contains one twice.
     """
     if not source.is_dir():
         raise TacpipeError(
@@ -90,14 +90,14 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
         assert match is not None
         material, trial = int(match[1]), int(match[2])
         if match[3] == "bio":
-            streams["biotac"] = _finger(path)
+            streams["biotac"] = _read_finger(path)
         else:
             stream, columns = ARM[match[3]]
-            streams[stream] = _arm(path, stream, columns)
+            streams[stream] = _read_arm(path, stream, columns)
     begin = next(iter(streams.values()))["t_ns"]
-    marked = published.published_attribute("biotac-slide", begin[0].as_py() if len(begin) else 0)
+    mark = published.published_attribute("biotac-slide", begin[0].as_py() if len(begin) else 0)
     # published slides of a material were recorded in one session; of others this is unknown
-    session = {"session": f"biotac-m{material:02d}"} if marked else {}
+    session = {"session": f"biotac-m{material:02d}"} if mark else {}
     return RecordingOutput(
         streams,
         {
@@ -106,13 +106,13 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
             "trial": trial,
             **session,
             "rate_hz": RATE_HZ,
-            **marked,
+            **mark,
             **xela.authors_role(params.authors_role),
         },
     )
 
 
-def _finger(path: Path) -> pa.Table:
+def _read_finger(path: Path) -> pa.Table:
     """Return the stream of the finger: 44 columns of uint16 counts as written, including spikes."""
     import pyarrow as pa
 
@@ -123,10 +123,11 @@ def _finger(path: Path) -> pa.Table:
     names += [f"pac{reading}" for reading in range(1, schema.VIBRATIONS + 1)]
     names += [f"ele{electrode}" for electrode in range(1, schema.ELECTRODES + 1)]
     table = read_csv(path, names, integers=pa.uint16(), trailing_comma=True, seconds="timestamp")
-    return _stream(path, table, schema.biotac_fields())
+    return _name_channels(path, table, schema.biotac_fields())
 
 
-def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
+def _read_arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
+    """Return a stream of the arm; ``columns`` are those of the file."""
     from tacpipe.channels import schema
     from tacpipe.formats.csv_table import read_csv
 
@@ -139,10 +140,10 @@ def _arm(path: Path, stream: str, columns: tuple[str, ...]) -> pa.Table:
         "joint_torque": schema.joint_torque_fields(),
         "joint_velocity": speeds,
     }[stream]
-    return _stream(path, read_csv(path, columns, allow_nan=stream == "twist", seconds="timestamp"), fields)
+    return _name_channels(path, read_csv(path, columns, allow_nan=stream == "twist", seconds="timestamp"), fields)
 
 
-def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
+def _name_channels(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
     """Return a table with the names of its channels. Raises `TacpipeError` if timestamps do not increase."""
     import numpy as np
     import pyarrow as pa
@@ -151,9 +152,9 @@ def _stream(path: Path, table: pa.Table, fields: list[pa.Field]) -> pa.Table:
     from tacpipe.formats.csv_table import place
 
     t_ns = table.column("t_ns").to_numpy()
-    back = np.diff(t_ns) <= 0
-    if back.any():
-        row = int(back.argmax()) + 1
+    goes_back = np.diff(t_ns) <= 0
+    if goes_back.any():
+        row = int(goes_back.argmax()) + 1
         raise TacpipeError(
             f"{path}, {place(path, row)}: the timestamp is {(t_ns[row] - t_ns[row - 1]) / 1e6:g} ms after the one "
             f"before; it must be later. Put the rows in order or leave the slide out."

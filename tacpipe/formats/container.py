@@ -273,6 +273,7 @@ def container_names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
 
 
 def _name_stem(path: Path) -> str:
+    """Return a container's file name without the suffix of its kind."""
     ending = max(
         (ending for kind in KINDS.values() for ending in kind.endings if path.name.lower().endswith(ending)),
         key=len,
@@ -290,10 +291,10 @@ def identifiers(sources: Sequence[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     used: set[str] = set()
     for source in sources:
-        letters = "".join(
+        spaced = "".join(
             letter if letter.isascii() and (letter.isalnum() or letter == "_") else " " for letter in source
         )
-        name = "_".join(letters.split()).strip("_") or "stream"
+        name = "_".join(spaced.split()).strip("_") or "stream"
         name = f"stream_{name}" if name[0].isdigit() else name
         number = 2
         candidate = name
@@ -333,13 +334,15 @@ EXAMPLES = 3  # number of example paths per group
 Reason = Callable[[str], str]  # maps a path in the source to the reason why it is not read, or ""
 
 
-def describe_unread(source: Path, read: Collection[Path], reason: Reason, output: Path | None = None) -> list[str]:
-    """Return one sentence per suffix and reason for the files below ``source`` that are not in ``read``.
+def describe_unread(
+    source: Path, read_files: Collection[Path], reason: Reason, output: Path | None = None
+) -> list[str]:
+    """Return one sentence per suffix and reason for the files below ``source`` that are not in ``read_files``.
 
     Hidden files and the folder ``output``, to which the command writes, are ignored.
     """
     groups: dict[tuple[str, str], list[str]] = {}
-    read_paths = {os.fspath(path) for path in read}
+    read_paths = {os.fspath(path) for path in read_files}
     for path in _visible(source, output):
         if path in read_paths:
             continue

@@ -67,23 +67,23 @@ def read_csv(
     another width, a cell that is not a number, NaN unless ``allow_nan``, infinity, invalid seconds, and, with
     ``integers``, a fraction or a value out of range.
     """
-    text = _table(path, trailing_comma)
-    names = text.names()
+    text_table = _table(path, trailing_comma)
+    names = text_table.names()
     _check_header(path, names, [seconds, *columns] if seconds else columns)
     types = {name: pa.float64() if name or not trailing_comma else pa.string() for name in names}
-    blocks = list(text.batches(types | ({seconds: SECONDS} if seconds else {})))
+    blocks = list(text_table.batches(types | ({seconds: SECONDS} if seconds else {})))
     if not blocks:
         raise TacpipeError(f"{path} has a header and no rows; the recording is empty. Delete it or record it again.")
     table = pa.concat_tables(blocks)
     if trailing_comma and any(table.column("").unique().to_pylist()):
         index, cell = next((index, cell) for index, cell in enumerate(table.column("").to_pylist()) if cell)
         raise TacpipeError(
-            f"{path}, {text.place(index)} ends in {excerpt(cell)} and other rows in a comma; a cell is too much."
+            f"{path}, {text_table.place(index)} ends in {excerpt(cell)} and other rows in a comma; a cell is too much."
         )
-    times = {"t_ns": pa.array(_nanoseconds(text, seconds, table.column(seconds)))} if seconds else {}
+    times = {"t_ns": pa.array(_nanoseconds(text_table, seconds, table.column(seconds)))} if seconds else {}
     arrays = {name: table.column(name).to_numpy() for name in columns}
     for name, array in arrays.items():
-        _check_values(text, name, array, integers, allow_nan)
+        _check_values(text_table, name, array, integers, allow_nan)
     return pa.table(
         {**times, **{name: pa.array(array).cast(integers or pa.float64()) for name, array in arrays.items()}}
     )
@@ -101,9 +101,9 @@ def read_record(path: Path) -> dict[str, str]:
     ``notes`` is joined again, empty cells at the end are dropped, and columns of missing cells at the end are omitted.
     Raises `TacpipeError` with file and line for any other width, and if there is not exactly one data row.
     """
-    text = _table(path)
-    names = text.header()
-    rows = [(line, cells) for line, cells in text.rows() if any(cell.strip() for cell in cells)][1:]
+    text_table = _table(path)
+    names = text_table.header()
+    rows = [(line, cells) for line, cells in text_table.rows() if any(cell.strip() for cell in cells)][1:]
     if len(rows) != 1:
         raise TacpipeError(f"{path} has {len(rows)} rows below its header; it must have one. Correct it and try again.")
     line, cells = rows[0]
@@ -111,8 +111,12 @@ def read_record(path: Path) -> dict[str, str]:
         cells = cells[:-1]
     surplus = len(cells) - len(names)
     if surplus > 0 and "notes" in names:
-        at = names.index("notes")
-        cells = [*cells[:at], ",".join(cells[at : at + surplus + 1]), *cells[at + surplus + 1 :]]
+        notes_index = names.index("notes")
+        cells = [
+            *cells[:notes_index],
+            ",".join(cells[notes_index : notes_index + surplus + 1]),
+            *cells[notes_index + surplus + 1 :],
+        ]
     elif surplus > 0:
         raise TacpipeError(
             f"{path}, line {line} has {len(cells)} cells under a header of {len(names)}; "
@@ -131,9 +135,10 @@ def _table(path: Path, trailing_comma: bool = False) -> _NumericTable:
 
 
 def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> None:
-    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
-    if doubled:
-        raise TacpipeError(f"{path} has more than one column {listed(doubled, 4)}; each name must be unique.")
+    """Raise `TacpipeError` if a header repeats a name or lacks one of ``columns``."""
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+    if repeated:
+        raise TacpipeError(f"{path} has more than one column {listed(repeated, 4)}; each name must be unique.")
     header_names = set(names)
     missing = [name for name in columns if name not in header_names]
     if missing:
@@ -143,22 +148,25 @@ def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> N
         )
 
 
-def _nanoseconds(text: TextTable, name: str, column: pa.ChunkedArray) -> Int64s:
-    """Return decimal seconds as whole nanoseconds, int64 (time,). Raises `TacpipeError` for those before 1970."""
+def _nanoseconds(text_table: TextTable, name: str, column: pa.ChunkedArray) -> Int64s:
+    """Return decimal seconds as whole nanoseconds, int64 (time,). Raises `TacpipeError` for times outside 1970 to 2262."""
     chunk = column.combine_chunks()
     t_ns, fits = stamps.last_digits(chunk)
     bad = ~fits | (t_ns < 0)
     if bad.any():
         index = int(bad.argmax())
         raise TacpipeError(
-            f"{text.path}, {text.place(index)}, column {name} holds {chunk[index].as_py():f}; it must be seconds since "
-            f"1970, which end in 2262 in nanoseconds. Correct the cell."
+            f"{text_table.path}, {text_table.place(index)}, column {name} holds {chunk[index].as_py():f}; it must be "
+            f"seconds since 1970, which end in 2262 in nanoseconds. Correct the cell."
         )
     return t_ns
 
 
-def _check_values(text: TextTable, name: str, array: Floats, integers: pa.DataType | None, nan: bool) -> None:
-    """Raise for the first value of a column that is not allowed."""
+def _check_values(text_table: TextTable, name: str, array: Floats, integers: pa.DataType | None, nan: bool) -> None:
+    """Raise `TacpipeError` for the first value of a column that is not finite, or not a value of the type ``integers``.
+
+    ``nan``: NaN is allowed.
+    """
     if nan:
         bad, expected = np.isinf(array), "a finite number or NaN"
     else:
@@ -170,5 +178,5 @@ def _check_values(text: TextTable, name: str, array: Floats, integers: pa.DataTy
     if bad.any():
         index = int(bad.argmax())
         raise TacpipeError(
-            f"{text.path}, {text.place(index)}, column {name} holds {array[index]:.12g}; it must be {expected}."
+            f"{text_table.path}, {text_table.place(index)}, column {name} holds {array[index]:.12g}; it must be {expected}."
         )

@@ -43,13 +43,13 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
             f"{source} is not a folder; give the folder that holds the trials, each a folder of CSV files."
         )
     expected_names = set(names)
-    holds: dict[Path, set[str]] = {}  # expected files in each trial
+    present_files: dict[Path, set[str]] = {}  # expected files in each trial
     for directory, _, files in walk(source):
         present_names = expected_names.intersection(files)
         if present_names or os.path.basename(directory).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
-            holds[Path(directory)] = present_names
-    parents = {folder.parent for folder in holds}
-    folders = sorted(folder for folder, present in holds.items() if present or folder not in parents)
+            present_files[Path(directory)] = present_names
+    parents = {folder.parent for folder in present_files}
+    folders = sorted(folder for folder, present in present_files.items() if present or folder not in parents)
     if not folders:
         raise TacpipeError(
             f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "
@@ -59,14 +59,15 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
     for folder in folders:
         by_name.setdefault(paths.folded_name(valid(folder.name)), []).append(folder)
     named_folders: list[tuple[str, Path]] = []
-    for same in by_name.values():
-        for folder in same:
+    for same_name in by_name.values():
+        for folder in same_name:
             name = valid(folder.name)
             above = folder.relative_to(source).parts[:-1]
-            named_folders.append((name if len(same) == 1 else valid("-".join([*above, name])), folder))
+            named_folders.append((name if len(same_name) == 1 else valid("-".join([*above, name])), folder))
     paths.refuse_shared_names(named_folders)
     return {
-        name: {file: folder / file for file in names if file in holds[folder]} for name, folder in sorted(named_folders)
+        name: {file: folder / file for file in names if file in present_files[folder]}
+        for name, folder in sorted(named_folders)
     }
 
 
@@ -88,12 +89,12 @@ def by_object(
     for directory, _, files in walk(source):
         present_names = [name for name in names if name in files]
         if present_names:
-            above, folder = os.path.split(os.path.abspath(directory))  # noqa: PTH100  (once a folder, on every hit)
-            label, folder = text(os.path.basename(above)), text(folder)  # noqa: PTH119
+            parent, name = os.path.split(os.path.abspath(directory))  # noqa: PTH100  (once a folder, on every hit)
+            label, folder = text(os.path.basename(parent)), text(name)  # noqa: PTH119
             recording = valid(f"{label}-{folder.removeprefix(prefix)}")
             named_folders.append((recording, Path(directory)))
             files_by_recording[recording] = {
-                f"{label}/{folder}/{name}": Path(directory, name) for name in present_names
+                f"{label}/{folder}/{file}": Path(directory, file) for file in present_names
             }
     paths.refuse_shared_names(named_folders)
     if not files_by_recording:
@@ -109,8 +110,8 @@ def require(files: Files, names: Sequence[str]) -> str:
     folder = next((path.parent for path in files.values()), None)
     missing = [name for name in names if name not in files]
     if missing:
-        place = str(folder) if folder else "A trial folder"
-        raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
+        subject = str(folder) if folder else "A trial folder"
+        raise TacpipeError(f"{subject} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
     assert folder is not None
     return text(folder.name)
 

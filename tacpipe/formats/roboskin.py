@@ -100,20 +100,20 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.formats import published
     from tacpipe.signals.resampling import uniform_grid
 
-    (block, place), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
-    slide = _read_slide(block, place)  # (triangle, taxel, time)
+    (block, index), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
+    slide = _read_slide(block, index)  # (triangle, taxel, time)
     if params.layout == "authors":
         slide = scramble(slide)
     frames = slide.shape[-1]
     t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz), params.rate_hz)
     columns = np.reshape(slide, (-1, frames))
-    material = _read_label(block, labels, place) + 1
+    material = _read_label(block, labels, index) + 1
     return RecordingOutput(
         {"roboskin": schema.stream(t_ns, columns, schema.roboskin_fields(), MADE)},
         {
             "sensor": "roboskin",
             "material": material,
-            "trial": place,
+            "trial": index,
             "session": f"roboskin-m{material:02d}",
             "rate_hz": params.rate_hz,
             "layout": params.layout,
@@ -126,28 +126,31 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
 def _find_blocks(source: Path) -> list[tuple[str, Path]]:
     """Return the blocks below a folder as pairs of name and path."""
     blocks = []
-    for folder, below, names in walk(source):
+    for folder, subfolders, names in walk(source):
         for name in sorted(names):
             match = BLOCK.fullmatch(name)
             if match is not None:
                 blocks.append((match[2] or f"fold{int(match[1])}", Path(folder) / name))
-                below.clear()  # subfolders of the published folder contain arrays derived from these
+                subfolders.clear()  # subfolders of the published folder contain arrays derived from these
     return blocks
 
 
 def _count_slides(path: Path) -> int:
-    """Return the number of slides in a block from its header only; loading numpy would take longer than a cache hit."""
+    """Return the number of slides in a block from its header only; loading numpy would take longer than a cache hit.
+
+    Raises `TacpipeError` if it is not an array of numbers (slide, triangle, taxel, time) of the declared size.
+    """
     try:
         with regular.failing(path), regular.opened(path) as file:
             if file.read(6) != b"\x93NUMPY":
                 raise ValueError("it does not begin as an array of numpy does")
-            wide = file.read(2)[0] > 1
-            length = int.from_bytes(file.read(4 if wide else 2), "little")
-            if length > MAX_HEADER_BYTES:
-                raise ValueError(f"its head has {length} bytes, {MAX_HEADER_BYTES} are allowed")
-            head = ast.literal_eval(file.read(length).decode())
+            is_long = file.read(2)[0] > 1
+            header_bytes = int.from_bytes(file.read(4 if is_long else 2), "little")
+            if header_bytes > MAX_HEADER_BYTES:
+                raise ValueError(f"its head has {header_bytes} bytes, {MAX_HEADER_BYTES} are allowed")
+            header = ast.literal_eval(file.read(header_bytes).decode())
             available = os.fstat(file.fileno()).st_size - file.tell()
-        shape, kind = head["shape"], KIND.fullmatch(head["descr"])
+        shape, kind = header["shape"], KIND.fullmatch(header["descr"])
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
     if not (isinstance(shape, tuple) and len(shape) == 4 and all(type(size) is int and size > 0 for size in shape)):
@@ -155,7 +158,7 @@ def _count_slides(path: Path) -> int:
             f"{path} has the shape {excerpt(shape)}; it must be (slide, triangle, taxel, time). Give the set's own files."
         )
     if kind is None:
-        described = excerpt(head["descr"])
+        described = excerpt(header["descr"])
         raise TacpipeError(
             f"{path} cannot be read as an array of numbers: it holds {described}. Copy it again from its source."
         )
@@ -180,7 +183,7 @@ def _role_attribute(block: Path) -> dict[str, Attribute]:
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
-def _read_slide(path: Path, place: int) -> Float32s:
+def _read_slide(path: Path, index: int) -> Float32s:
     """Return a measured slide (triangle, taxel, time) as float32, with its values checked.
 
     If a slide has too little contact to reveal its time axis, the axis of its block is used. Raises `TacpipeError` for
@@ -196,12 +199,12 @@ def _read_slide(path: Path, place: int) -> Float32s:
             f"{path} is an array of {block.dtype} of the shape {block.shape}; it must hold numbers, and be (slide, "
             f"{TRIANGLES} triangles, {TRIANGLE_TAXELS} taxels, two or more frames)."
         )
-    slide = np.array(block[place], dtype=np.float32)  # (triangle, taxel, time)
+    slide = np.array(block[index], dtype=np.float32)  # (triangle, taxel, time)
     if not np.isfinite(slide).all():
-        raise TacpipeError(f"{path}, slide {place} holds values that are not finite. Copy the file again.")
+        raise TacpipeError(f"{path}, slide {index} holds values that are not finite. Copy the file again.")
     if slide.min() < 0 or slide.max() > MAX_READING:
         raise TacpipeError(
-            f"{path}, slide {place} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
+            f"{path}, slide {index} holds values from {slide.min():g} to {slide.max():g}; readings lie from 0 to "
             f"{MAX_READING:g}. It looks like 8-bit numbers that wrapped. Copy the file again, or leave the slide out."
         )
     for evidence in (slide, block):
@@ -211,23 +214,26 @@ def _read_slide(path: Path, place: int) -> Float32s:
             values: Float32s = unscramble(slide)
             return values
     raise TacpipeError(
-        f"{path}, slide {place}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
+        f"{path}, slide {index}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
         f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or "
         f"more, and more than along other axes. Check how the array was made."
     )
 
 
-def _read_label(block: Path, path: Path, place: int) -> int:
-    """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one integer per slide."""
+def _read_label(block: Path, path: Path, index: int) -> int:
+    """Return the label of slide ``place`` of a block, from 0; ``path`` has one label per slide.
+
+    Raises `TacpipeError` if the labels are not one integer per slide.
+    """
     import numpy as np
 
     labels, slides = np.atleast_1d(_cached_array(path)).ravel(), len(_cached_array(block))
     if len(labels) != slides:
         raise TacpipeError(f"{path} has {len(labels)} labels and {block.name} {slides} slides; copy both files again.")
-    label = labels[place]
+    label = labels[index]
     if labels.dtype.kind not in "fiu" or not (0 <= label <= MAX_LABEL and label == np.rint(label)):
         raise TacpipeError(
-            f"{path}, label {place} is {excerpt(label)}; it must be a whole number from 0 to {MAX_LABEL}. Copy the "
+            f"{path}, label {index} is {excerpt(label)}; it must be a whole number from 0 to {MAX_LABEL}. Copy the "
             f"file again."
         )
     return int(label)
@@ -251,9 +257,9 @@ def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
     content = regular.source(path)
     try:
         file = io.BytesIO(content)
-        wide = np.lib.format.read_magic(file) != (1, 0)
-        read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
-        shape, _, kind = read_head(file)
+        is_long = np.lib.format.read_magic(file) != (1, 0)
+        read_header = np.lib.format.read_array_header_2_0 if is_long else np.lib.format.read_array_header_1_0
+        shape, _, kind = read_header(file)
         if math.prod(shape) * kind.itemsize > len(content):  # checked before np.load, which allocates the array
             raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
         array: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
@@ -281,10 +287,10 @@ def lag_one(values: AnyArray, axis: int) -> float:
     import numpy as np
 
     moved = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
-    before, after = moved[:-1].ravel(), moved[1:].ravel()
-    if not before.size or not np.isfinite(moved).all():
+    first, second = moved[:-1].ravel(), moved[1:].ravel()
+    if not first.size or not np.isfinite(moved).all():
         return float("nan")
-    before, after = before - before.mean(), after - after.mean()
+    before, after = first - first.mean(), second - second.mean()
     spread = float(np.sqrt((before @ before) * (after @ after)))
     return float(before @ after) / spread if spread > 0 else float("nan")
 

@@ -112,14 +112,14 @@ def session(label: str, time_s: int) -> str:
 
 def _add_twins(files_by_grasp: dict[str, dict[str, Path]]) -> None:
     """Add to each grasp the file of the earliest other grasp with the same reading."""
-    same: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # (time, recording, file) by digest
+    same_reading: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # (time, recording, file) by digest
     for recording, files in files_by_grasp.items():
         for name, path in files.items():
             if name.endswith(READING):
-                same[remembered_file_digest(path)].append((name.split("/")[1], recording, path))
-    for twins in same.values():
-        (_, first, path), *later = sorted(twins)
-        for _, recording, _ in later:
+                same_reading[remembered_file_digest(path)].append((name.split("/")[1], recording, path))
+    for twins in same_reading.values():
+        (_, first, path), *duplicates = sorted(twins)
+        for _, recording, _ in duplicates:
             files_by_grasp[recording][f"{TWIN}{first}"] = path
 
 
@@ -137,7 +137,10 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def _read_grasp(path: Path) -> Grasp:
-    """Return the grasp in a file: six numbers in metres on one line, or fifteen with the wrist's rotation."""
+    """Return the grasp in a file: six numbers in metres on one line, or fifteen with the wrist's rotation.
+
+    Raises `TacpipeError` for anything else.
+    """
     import numpy as np
 
     from tacpipe.clouds.grasp import Grasp

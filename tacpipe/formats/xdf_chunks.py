@@ -52,50 +52,50 @@ def read_chunks(data: Content) -> Iterator[Chunk | DamagedChunk]:
     """
     if data[: len(MAGIC)] != MAGIC:
         raise TacpipeError(f"it begins with {data[:4]!r}, and an XDF file with {MAGIC!r}")
-    at = len(MAGIC)
-    while at < len(data):
-        parsed = _parse_chunk(data, at)
+    offset = len(MAGIC)
+    while offset < len(data):
+        parsed = _parse_chunk(data, offset)
         if parsed is not None and parsed[0].is_complete:
-            chunk, at = parsed
+            chunk, offset = parsed
             if chunk.tag != BOUNDARY:
                 yield chunk
             continue
-        next_mark = data.find(MARK, at)
+        next_mark = data.find(MARK, offset)
         if parsed is not None and next_mark < 0:  # the file is truncated
             yield parsed[0]
             return
         stop = len(data) if next_mark < 0 else next_mark + len(MARK)
-        yield DamagedChunk(at, stop - at)
-        at = stop
+        yield DamagedChunk(offset, stop - offset)
+        offset = stop
 
 
-def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
-    """Return the chunk at an offset and its end, or None if there is no valid chunk."""
-    length = read_length(data, at)
+def _parse_chunk(data: Content, offset: int) -> tuple[Chunk, int] | None:
+    """Return the chunk at an offset and the offset after it, or None if there is no valid chunk."""
+    length = read_length(data, offset)
     if length is None:
         return None
-    size, begin = length
-    stop = begin + size
-    if size < 2 or begin + 2 > len(data):
+    size, content_start = length
+    stop = content_start + size
+    if size < 2 or content_start + 2 > len(data):
         return None
-    (tag,) = struct.unpack_from("<H", data, begin)
-    head = 6 if tag in OF_A_STREAM else 2
-    if not FILE_HEADER <= tag <= STREAM_FOOTER or size < head or begin + head > len(data):
+    (tag,) = struct.unpack_from("<H", data, content_start)
+    header_bytes = 6 if tag in OF_A_STREAM else 2
+    if not FILE_HEADER <= tag <= STREAM_FOOTER or size < header_bytes or content_start + header_bytes > len(data):
         return None
-    stream = struct.unpack_from("<I", data, begin + 2)[0] if head == 6 else None
-    return Chunk(at, tag, stream, data[begin + head : stop], is_complete=stop <= len(data)), stop
+    stream = struct.unpack_from("<I", data, content_start + 2)[0] if header_bytes == 6 else None
+    return Chunk(offset, tag, stream, data[content_start + header_bytes : stop], is_complete=stop <= len(data)), stop
 
 
-def read_length(data: Content, at: int) -> tuple[int, int] | None:
-    r"""Return a length of 1, 4 or 8 bytes and where it ends, or None if there is none.
+def read_length(data: Content, offset: int) -> tuple[int, int] | None:
+    r"""Return a length of 1, 4 or 8 bytes and the offset after it, or None if there is none.
 
     >>> read_length(b"\x01\x05...", 0), read_length(b"\x02\x05", 0)
     ((5, 2), None)
     """
-    width = data[at] if at < len(data) else 0
-    if width not in SIZES or at + 1 + width > len(data):
+    width = data[offset] if offset < len(data) else 0
+    if width not in SIZES or offset + 1 + width > len(data):
         return None
-    return struct.unpack_from(SIZES[width], data, at + 1)[0], at + 1 + width
+    return struct.unpack_from(SIZES[width], data, offset + 1)[0], offset + 1 + width
 
 
 @dataclass(frozen=True)
@@ -114,24 +114,24 @@ def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> 
         return None
     declared, begin = count
     body = content[begin:]
-    wide = kind.newbyteorder("<")
-    for stamped in (declared, 1 if declared else 0, 0):  # all samples have a timestamp, only the first, or none
-        samples = _parse_regular(body, wide, channels, declared, stamped)
+    little_endian = kind.newbyteorder("<")
+    for stamp_count in (declared, 1 if declared else 0, 0):  # all samples have a timestamp, only the first, or none
+        samples = _parse_regular(body, little_endian, channels, declared, stamp_count)
         if samples is not None:
             return samples
-    return _parse_irregular(body, wide, channels, declared)
+    return _parse_irregular(body, little_endian, channels, declared)
 
 
 def _parse_regular(
     body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int
 ) -> ChunkSamples | None:
     """Return the samples if exactly the first ``stamped`` have a timestamp, or None if the bytes do not fit this."""
-    full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
-    bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
-    if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:
+    with_stamp = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
+    without_stamp = np.dtype([("width", "u1"), ("values", kind, (channels,))])
+    if len(body) != stamped * with_stamp.itemsize + (count - stamped) * without_stamp.itemsize:
         return None
-    first = np.frombuffer(body, full, stamped)
-    unstamped = np.frombuffer(body, bare, count - stamped, offset=stamped * full.itemsize)
+    first = np.frombuffer(body, with_stamp, stamped)
+    unstamped = np.frombuffer(body, without_stamp, count - stamped, offset=stamped * with_stamp.itemsize)
     if (first["width"] != 8).any() or unstamped["width"].any():
         return None
     stamps = np.concatenate([first["stamp"], np.full(len(unstamped), np.nan)])
@@ -139,17 +139,17 @@ def _parse_regular(
 
 
 def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> ChunkSamples:
-    """Parse samples one by one, up to the first incomplete one."""
-    stamps, values, at, size = [], [], 0, channels * kind.itemsize
+    """Return the samples before the first incomplete one, parsed one by one."""
+    stamps, values, offset, size = [], [], 0, channels * kind.itemsize
     for _ in range(count):
-        stamp = _read_stamp(body, at)
+        stamp = _read_stamp(body, offset)
         if stamp is None or stamp[1] + size > len(body):
             break
         stamps.append(stamp[0])
         values.append(body[stamp[1] : stamp[1] + size])
-        at = stamp[1] + size
-    read = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
-    return ChunkSamples(np.array(stamps, dtype=np.float64), read, count - len(stamps))
+        offset = stamp[1] + size
+    table = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
+    return ChunkSamples(np.array(stamps, dtype=np.float64), table, count - len(stamps))
 
 
 def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
@@ -157,39 +157,41 @@ def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
     count = read_length(content, 0)
     if count is None:
         return None
-    declared, at = count
+    declared, offset = count
     stamps: list[float] = []
     rows: list[list[str]] = []
     while len(rows) < declared:
-        stamp = _read_stamp(content, at)
+        stamp = _read_stamp(content, offset)
         words = None if stamp is None else _read_words(content, stamp[1], channels)
         if stamp is None or words is None:
             break
         stamps.append(stamp[0])
         rows.append(words[0])
-        at = words[1]
+        offset = words[1]
     table = np.array(list(itertools.chain(*rows)), dtype=object).reshape(-1, channels)
     return ChunkSamples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
 
 
 def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:
-    words = []
+    """Return ``count`` texts and the offset after them, or None if they are incomplete."""
+    words, stop = [], at
     for _ in range(count):
-        length = read_length(content, at)
+        length = read_length(content, stop)
         if length is None or length[1] + length[0] > len(content):
             return None
-        at = length[1] + length[0]
-        words.append(content[length[1] : at].decode(errors="replace"))
-    return words, at
+        size, start = length
+        stop = start + size
+        words.append(content[start:stop].decode(errors="replace"))
+    return words, stop
 
 
-def _read_stamp(content: bytes, at: int) -> tuple[float, int] | None:
+def _read_stamp(content: bytes, offset: int) -> tuple[float, int] | None:
     """Return a sample's timestamp (NaN if not written) and the offset of its values, or None if it is incomplete."""
-    if at >= len(content) or content[at] not in (0, 8) or at + 1 + content[at] > len(content):
+    if offset >= len(content) or content[offset] not in (0, 8) or offset + 1 + content[offset] > len(content):
         return None
-    if not content[at]:
-        return float("nan"), at + 1
-    return struct.unpack_from("<d", content, at + 1)[0], at + 9
+    if not content[offset]:
+        return float("nan"), offset + 1
+    return struct.unpack_from("<d", content, offset + 1)[0], offset + 9
 
 
 def fill_stamps(stamps: Floats, last: float, period_s: float) -> Floats:
@@ -198,14 +200,14 @@ def fill_stamps(stamps: Floats, last: float, period_s: float) -> Floats:
     >>> fill_stamps(np.array([np.nan, 5.0, np.nan]), 1.0, 0.5).tolist()
     [1.5, 5.0, 5.5]
     """
-    absent = np.isnan(stamps)
-    if not absent.any():
+    is_missing = np.isnan(stamps)
+    if not is_missing.any():
         return stamps
     filled = stamps.copy()
-    stamped_rows = np.flatnonzero(~absent).tolist()
-    before = [last, *stamps[stamped_rows].tolist()]
+    stamped_rows = np.flatnonzero(~is_missing).tolist()
+    previous_stamps = [last, *stamps[stamped_rows].tolist()]
     edges = [-1, *stamped_rows, len(stamps)]
-    for begin, (row, stop) in zip(before, itertools.pairwise(edges), strict=True):
-        steps = np.concatenate([[begin], np.full(stop - row - 1, period_s)])
+    for previous, (row, stop) in zip(previous_stamps, itertools.pairwise(edges), strict=True):
+        steps = np.concatenate([[previous], np.full(stop - row - 1, period_s)])
         filled[row + 1 : stop] = np.add.accumulate(steps)[1:]
     return filled

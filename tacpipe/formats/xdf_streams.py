@@ -59,7 +59,7 @@ class _StreamReading:
     declared: int | None = None  # number of samples according to the footer
 
     def add_samples(self, content: bytes) -> None:
-        """Add the samples of a chunk."""
+        """Add the samples of a chunk; timestamps that are not written continue at the stream's rate."""
         channels = len(self.about.channels)
         samples = (
             xdf_chunks.parse_texts(content, channels)
@@ -159,38 +159,39 @@ class XdfFile:
 
         Raises `TacpipeError` if the file is not XDF.
         """
-        read = self._read()
-        sources_by_number = _stream_sources(read.streams)
+        reading = self._read()
+        sources_by_number = _stream_sources(reading.streams)
         names = container.identifiers(
             [name for source in sources_by_number.values() for name in (source, source + OFFSETS)]
         )
         streams: list[SourceStream] = []
-        attributes = _file_attributes(read.header)
-        notes = read.notes(self.path)
-        skipped = {f"stream {number}": reason for number, reason in read.unknown.items() if reason != UNDESCRIBED}
+        attributes = _file_attributes(reading.header)
+        notes = reading.notes(self.path)
+        skipped = {f"stream {number}": reason for number, reason in reading.unknown.items() if reason != UNDESCRIBED}
         for number, source in sources_by_number.items():
-            stream = read.streams[number]
+            stream = reading.streams[number]
             if not stream.rows:
                 skipped[source] = "it has no samples"
                 continue
-            timed = _recorder_times(stream)
-            if isinstance(timed, str):
-                skipped[source] = timed
+            times_or_reason = _recorder_times(stream)
+            if isinstance(times_or_reason, str):
+                skipped[source] = times_or_reason
                 continue
-            t_ns, facts, described = timed
-            notes += [f"{self.path}: {plain(source)} {name}" for name in [*described, *_describe_losses(stream)]]
+            t_ns, facts, remarks = times_or_reason
+            notes += [f"{self.path}: {plain(source)} {remark}" for remark in [*remarks, *_describe_losses(stream)]]
             attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
             streams.append(
                 SourceStream(source, names[source], Time(STAMP, "ns"), _stream_content(stream, t_ns), stream.rows)
             )
             if stream.offsets:
-                source += OFFSETS
                 offsets = _offsets_table(stream)
-                streams.append(SourceStream(source, names[source], Time(STAMP, "ns"), offsets, offsets.num_rows))
-        chosen = [name for name in streams if sources is None or name.source in sources]
-        return EpisodeContents(chosen, attributes, skipped, notes)
+                name = names[source + OFFSETS]
+                streams.append(SourceStream(source + OFFSETS, name, Time(STAMP, "ns"), offsets, offsets.num_rows))
+        selected = [stream for stream in streams if sources is None or stream.source in sources]
+        return EpisodeContents(selected, attributes, skipped, notes)
 
     def _read(self) -> _FileReading:
+        """Read all chunks of the file. Raises `TacpipeError` if it is not XDF."""
         reading = _FileReading()
         try:
             content = _open_content(self.path)
@@ -198,9 +199,8 @@ class XdfFile:
             for chunk in xdf_chunks.read_chunks(content):
                 _add_chunk(reading, chunk, self.path)
                 if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
-                    content.madvise(
-                        mmap.MADV_DONTNEED, passed, PASSED_BYTES
-                    )  # without this, the whole file stays mapped in memory
+                    # without this, the whole file stays mapped in memory
+                    content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
                     passed += PASSED_BYTES
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
@@ -280,6 +280,7 @@ def _store_description(read: _FileReading, stream: int, chunk: Chunk, path: Path
 
 
 def _sample_count(footer: bytes) -> int | None:
+    """Return the number of samples in a footer, or None if it has none."""
     try:
         text = ET.fromstring(footer.decode(errors="replace")).findtext("sample_count", "")
     except ET.ParseError:
@@ -295,6 +296,7 @@ def _stream_sources(streams: Mapping[int, _StreamReading]) -> dict[int, str]:
 
 
 def _file_attributes(header: bytes) -> dict[str, Attribute]:
+    """Return the attribute with the start of the recording, if the file header has one."""
     try:
         stamp = ET.fromstring(header.decode(errors="replace")).findtext("datetime", "").strip()
     except ET.ParseError:
@@ -320,17 +322,17 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
         return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.MAX_TIME_S)][0]))} is not a time in seconds"
     raw_ns = lsl.nanoseconds(raw_s)
     measured = _valid_offsets(stream)
-    facts: dict[str, Attribute] = {}
-    described: list[str] = []
+    attributes: dict[str, Attribute] = {}
+    remarks: list[str] = []
     t_ns = raw_ns
     if len(measured):
         lines = clocks.fit_offsets(measured[:, 0], measured[:, 1])
         starts = [0, *(_reset_row(stream, raw_ns, measured, line.start) for line in lines[1:])]
         t_ns = clocks.times_by_offsets(lines, starts, raw_ns)
         longest = max(lines, key=lambda line: line.stop - line.start)
-        facts = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
+        attributes = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
     else:
-        described.append("has no clock offsets: its stamps are taken for the recorder's.")
+        remarks.append("has no clock offsets: its stamps are taken for the recorder's.")
     back_ns = np.maximum.accumulate(t_ns) - t_ns
     if back_ns.any():
         rows = int(np.count_nonzero(back_ns))
@@ -340,10 +342,10 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
                 f"its clock went back by {back_ns[row] / 1e9:.6g} s at sample {row + 1}, and no clock offset states by how "
                 "much it was set"
             )
-        described.append(
+        remarks.append(
             f"has {rows:,} stamps before the one above, by up to {back_ns.max() / 1e9:.6g} s: t_ns has that one for them."
         )
-    return t_ns + back_ns, facts, described
+    return t_ns + back_ns, attributes, remarks
 
 
 def _valid_offsets(stream: _StreamReading) -> Int64s:
@@ -361,8 +363,8 @@ def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: i
 
     The sample is between that measurement and the previous one or, because samples are written late, just after it.
     """
-    sound = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
-    rows = [*(stream.rows_before[place] for place in sound.tolist()), len(raw_ns)]
+    valid_rows = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
+    rows = [*(stream.rows_before[place] for place in valid_rows.tolist()), len(raw_ns)]
     low, high = rows[first - 1], min(rows[first + 1], len(raw_ns))
     steps = np.diff(raw_ns[max(low - 1, 0) : high])
     if not len(steps):

@@ -121,6 +121,7 @@ class TrialMeta:
         return self._read(name, moment, "a date and time as 2021-11-24 15:20:42.172409")
 
     def _read(self, name: str, read: Callable[[str], T], expected: str) -> T:
+        """Return ``read`` of a cell. Raises `TacpipeError` if the cell is missing or ``read`` fails."""
         cell = self.cells.get(name, "")
         try:
             if cell:

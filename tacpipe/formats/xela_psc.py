@@ -47,9 +47,9 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     meta = xela.TrialMeta(files[xela.META])
     tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
     joints = [f"joint{n}" for n in range(1, 8)]
-    moving = [f"position_{joint}" for joint in joints] + [f"velocity_{joint}" for joint in joints]
-    robot = xela.read_floats(files[ROBOT], [*moving, "v_x", "v_y", "time"])  # (time, 17)
-    pose = _poses(files[ROBOT])  # (time, 7)
+    joint_columns = [f"position_{joint}" for joint in joints] + [f"velocity_{joint}" for joint in joints]
+    robot = xela.read_floats(files[ROBOT], [*joint_columns, "v_x", "v_y", "time"])  # (time, 17)
+    pose = _read_poses(files[ROBOT])  # (time, 7)
     marker, unseen = xela.read_marker(files[MARKER], "marker")
     labels = read_csv(files[LABELS], ["slip", "fail"], integers=pa.int8())
     rows = {name: len(tactile[stream][0]) for stream, name in xela.SENSORS.items()}
@@ -58,25 +58,27 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
 
     t_ns = np.int64(meta.utc_ns("start_time")) + _stamps_ns(files[ROBOT], robot[:, -1])
     angles, speeds = schema.joint_fields()
-    planned = [
+    command_fields = [
         schema.float_field(f"commanded_velocity_{axis}_m_s", "m/s", "velocity", axis) for axis in schema.AXES[:2]
     ]
     streams = xela.tactile_streams(tactile, t_ns, None)
     streams["robot"] = schema.stream(
-        t_ns, [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T], [*angles, *speeds, *schema.pose_fields(), *planned]
+        t_ns,
+        [*robot[:, :14].T, *pose.T, *robot[:, 14:16].T],
+        [*angles, *speeds, *schema.pose_fields(), *command_fields],
     )
     streams["marker"] = schema.stream(t_ns[: len(marker)], marker.T, schema.pose_fields())
-    marks = [labels.column(name).to_numpy() for name in labels.column_names]
-    _require_flags(files[LABELS], labels.column_names, marks)
+    labels_by_column = [labels.column(name).to_numpy() for name in labels.column_names]
+    _require_flags(files[LABELS], labels.column_names, labels_by_column)
     fields = [schema.label_field(name) for name in labels.column_names]
-    streams["slip"] = schema.stream(t_ns[: labels.num_rows], marks, fields)
+    streams["slip"] = schema.stream(t_ns[: labels.num_rows], labels_by_column, fields)
     return RecordingOutput(
         streams,
         {
             "sensor": "xela-uskin",
             "dropped": meta.flag("dropped"),
-            "slipped": bool(marks[0].any()),
-            "failed": bool(marks[1].any()),
+            "slipped": bool(labels_by_column[0].any()),
+            "failed": bool(labels_by_column[1].any()),
             "covering": meta.text("sensor_type"),
             "rate_hz": round(mean_rate_hz(t_ns), 6),
             "trial": trial,
@@ -86,8 +88,11 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     )
 
 
-def _poses(path: Path) -> Floats:
-    """Return position and quaternion (time, 7) from the 4x4 transforms in a file, which are stored in column-major order."""
+def _read_poses(path: Path) -> Floats:
+    """Return position and quaternion (time, 7) from the 4x4 transforms in a file, which are in column-major order.
+
+    Raises `TacpipeError` if a transform is not rigid.
+    """
     import numpy as np
 
     from tacpipe.formats import xela
@@ -96,9 +101,9 @@ def _poses(path: Path) -> Floats:
 
     entries = [f"ee_T_{row}{column}" for row in range(4) for column in range(4)]  # named by row and column
     transforms = xela.read_floats(path, entries).reshape(-1, 4, 4)
-    turned, moved = transforms[:, :3, :3], transforms[:, :3, 3]
-    error = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))  # (time,)
-    error = np.maximum(error, np.abs(np.linalg.det(turned) - 1))
+    rotations, positions = transforms[:, :3, :3], transforms[:, :3, 3]
+    error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))  # (time,)
+    error = np.maximum(error, np.abs(np.linalg.det(rotations) - 1))
     error = np.maximum(error, np.abs(transforms[:, 3] - [0, 0, 0, 1]).max(axis=1))
     if (error > ORTHONORMAL_TOLERANCE).any():
         row = int((error > ORTHONORMAL_TOLERANCE).argmax())
@@ -106,7 +111,7 @@ def _poses(path: Path) -> Floats:
             f"{path}, {place(path, row)}: ee_T is not a rigid transform; it is off by {error[row]:.3g}, "
             f"{ORTHONORMAL_TOLERANCE} is allowed. Check that ee_T_03, ee_T_13 and ee_T_23 hold the position."
         )
-    return np.column_stack([moved, make_continuous(matrices_to_quaternions(turned))])
+    return np.column_stack([positions, make_continuous(matrices_to_quaternions(rotations))])
 
 
 def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
@@ -115,9 +120,9 @@ def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
 
     from tacpipe.formats.csv_table import place
 
-    back = np.diff(time_s) < 0
-    if back.any():
-        row = int(back.argmax()) + 1
+    goes_back = np.diff(time_s) < 0
+    if goes_back.any():
+        row = int(goes_back.argmax()) + 1
         raise TacpipeError(
             f"{path}, {place(path, row)}: time runs backwards from {time_s[row - 1]:.9g} s to "
             f"{time_s[row]:.9g} s. Put the rows in order or leave the trial out."
@@ -126,6 +131,7 @@ def _stamps_ns(path: Path, time_s: Floats) -> Int64s:
 
 
 def _require_flags(path: Path, names: list[str], marks: list[NDArray[np.int8]]) -> None:
+    """Raise `TacpipeError` if a label column has a value other than 0 and 1."""
     from tacpipe.formats.csv_table import place
 
     for name, values in zip(names, marks, strict=True):

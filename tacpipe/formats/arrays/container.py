@@ -72,7 +72,7 @@ class ArrayContainer:
             return _read_contents(tree, episodes.find_episode(tree, episode), sources, self._rows)
 
     def _rows(self, tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table | Batched:
-        """Return the rows of a stream. More than one block is read block by block when needed."""
+        """Return the rows of a stream of a recording: a table, or several blocks that are read when needed."""
         start, count = episode.start, episodes.row_count(episode, part)
         step = _block_rows(tree, episode, part)
         edges = [start, *range((start // step + 1) * step, start + count, step), start + count]
@@ -97,11 +97,8 @@ class ArrayContainer:
             arrays = [*contents.scalars, *(array for part in selected for array in part.all_arrays)]
             files: dict[str, Path] = {}
             for array in arrays:
-                chunks = tree.files(
-                    array,
-                    array_episode.start,
-                    array.shape[0] if array_episode.stop is None and array.shape else array_episode.stop or 1,
-                )
+                stop = array_episode.stop or (array.shape[0] if array.shape else 1)
+                chunks = tree.files(array, array_episode.start, stop)
                 if chunks is None:
                     return None
                 files |= chunks
@@ -128,29 +125,35 @@ def open_zarr(path: Path) -> ArrayContainer:
 
 
 def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None, rows: RowsOf) -> EpisodeContents:
-    streams_and_scalars = episodes.group_into_parts(tree, episode)
-    skipped = dict(streams_and_scalars.skipped)
-    attributes, long = _read_attributes(tree, episode)
-    for scalar in streams_and_scalars.scalars:
+    """Return the streams, attributes and skipped arrays of a recording. ``rows`` returns the rows of a stream.
+
+    Without ``sources``, streams without timestamps or a rate are skipped if other streams have them.
+    """
+    contents = episodes.group_into_parts(tree, episode)
+    skipped = dict(contents.skipped)
+    attributes, long_texts = _read_attributes(tree, episode)
+    for scalar in contents.scalars:
         row = episode.number if scalar.shape else 0
         name = scalar.name if scalar.group == episode.ends_group else episode.inside(scalar.path).replace("/", ".")
         attributes |= plain_attributes({name: tree.read(scalar, row, row + 1)})
     attributes |= {**plain_attributes(episode.labels), **_masks(tree, episode)}
-    skipped |= long
+    skipped |= long_texts
     parts_read = []
-    for part in streams_and_scalars.parts:
+    for part in contents.parts:
         array, is_empty = part.arrays[0], not episodes.row_count(episode, part)
         if part.frames and not is_empty and not pixel_format(array) and not is_encoded(tree, array, episode.start):
             skipped[part.source] = "holds pictures that are not encoded as JPEG, PNG or WebP, which are not read"
         else:
             parts_read.append(part)
-    timed = [(part, episodes.time_of_part(tree, episode, part)) for part in parts_read]
-    chosen = [(part, time) for part, time in timed if (part.source in sources if sources is not None else True)]
-    if sources is None and any(time.is_declared for _, time in chosen):
-        for part, time in chosen:
+    parts_and_times = [(part, episodes.time_of_part(tree, episode, part)) for part in parts_read]
+    selected = [
+        (part, time) for part, time in parts_and_times if (part.source in sources if sources is not None else True)
+    ]
+    if sources is None and any(time.is_declared for _, time in selected):
+        for part, time in selected:
             if not time.is_declared:
                 skipped[part.source] = "has no stamps and no rate; a layout that names it gives them"
-        chosen = [(part, time) for part, time in chosen if time.is_declared]
+        selected = [(part, time) for part, time in selected if time.is_declared]
     names = _stream_names(parts_read)
     streams = [
         SourceStream(
@@ -160,7 +163,7 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
             rows(tree, episode, part),
             episodes.row_count(episode, part),
         )
-        for part, time in chosen
+        for part, time in selected
     ]
     return EpisodeContents(streams, attributes, skipped, tree.notes)
 
@@ -178,15 +181,19 @@ def _decode_texts(values: AnyArray) -> set[str]:
 
 
 def _stream_names(parts_read: Sequence[StreamArrays]) -> dict[str, str]:
-    """Return a name for each stream by its source: the last part of the path if that is unique."""
+    """Return a name for each stream by its source: the last part of the path if that is unique, else the path.
+
+    The recording's own group is named ``steps``.
+    """
     last = [part.source.rpartition("/")[2] for part in parts_read]
     root = "steps" if "steps" not in last else episodes.ROOT
-    called = {
-        part.source: root if part.source == episodes.ROOT else name if last.count(name) == 1 else part.source
-        for part, name in zip(parts_read, last, strict=True)
-    }
-    names = container.identifiers(list(called.values()))
-    return {source: names[name] for source, name in called.items()}
+    short_names = {}
+    for part, name in zip(parts_read, last, strict=True):
+        short_names[part.source] = name if last.count(name) == 1 else part.source
+        if part.source == episodes.ROOT:
+            short_names[part.source] = root
+    names = container.identifiers(list(short_names.values()))
+    return {source: names[name] for source, name in short_names.items()}
 
 
 def _first_rows(tree: Tree, episode: Episode, part: StreamArrays) -> pa.Table:
@@ -206,6 +213,7 @@ def _block_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
 
 
 def _rows_table(tree: Tree, episode: Episode, part: StreamArrays, start: int, stop: int) -> pa.Table:
+    """Return rows ``start`` to ``stop`` (exclusive) of a stream as a table with fields for each array."""
     fields: list[pa.Field] = []
     values: list[pa.Array] = []
     is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))
@@ -213,19 +221,22 @@ def _rows_table(tree: Tree, episode: Episode, part: StreamArrays, start: int, st
         if part.frames and array is not part.time:
             array_columns = [picture_column(array, tree.read(array, start, stop))]
         else:
-            about = (
+            meanings = (
                 column_names.aloha_meanings(array.name, array.shape[-1]) if is_aloha and len(array.shape) == 2 else None
             )
-            array_columns = list(columns_of_array(tree, array, start, stop, about))
+            array_columns = list(columns_of_array(tree, array, start, stop, meanings))
         fields += [field for field, _ in array_columns]
         values += [column for _, column in array_columns]
     return pa.table(values, pa.schema(fields))
 
 
 def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute], dict[str, str]]:
-    """Return the attributes of a recording's group and its parents, and the texts that are too long for attributes."""
+    """Return the attributes of a recording's group and its parents, and why texts were left out, by attribute.
+
+    A JSON object in a text becomes one attribute per value. Texts that are too long for an attribute are left out.
+    """
     attributes: dict[str, Attribute] = {}
-    long: dict[str, str] = {}
+    left_out: dict[str, str] = {}
     for group in episodes.parent_groups(episode.group):
         for name, value in tree.attributes(group).items():
             text = value.decode(errors="replace") if isinstance(value, bytes) else value
@@ -234,8 +245,8 @@ def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute]
                 {f"{name}.{key}": inner_value for key, inner_value in inner.items()} if inner else {name: value}
             )
             if isinstance(text, str) and len(text) > MAX_TEXT and not inner:
-                long[f"attribute {plain(name)}"] = f"is a text of {len(text)} characters, too long for a label"
-    return attributes, long
+                left_out[f"attribute {plain(name)}"] = f"is a text of {len(text)} characters, too long for a label"
+    return attributes, left_out
 
 
 def _flatten_json(text: Any) -> StoredAttributes:
@@ -254,6 +265,7 @@ def _flatten_json(text: Any) -> StoredAttributes:
 
 
 def _leaves(value: StoredAttributes, before: str = "") -> Iterator[tuple[str, StoredValue]]:
+    """Yield the dotted name and value of each leaf of nested objects, up to `MAX_DEPTH` levels."""
     for name, inner in value.items():
         if isinstance(inner, dict) and before.count(".") < MAX_DEPTH:
             yield from _leaves(inner, f"{before}{name}.")

@@ -56,7 +56,8 @@ class Episode:
 def find_episodes(tree: Tree) -> list[Episode]:
     """Return the recordings of a tree in natural order of their names; one unnamed recording for an undivided tree.
 
-    Raises `TacpipeError` if the ends of recordings do not divide the arrays.
+    Recordings are divided by an array of their end rows, or are numbered groups. Raises `TacpipeError` if the ends do
+    not divide the arrays.
     """
     episodes = _episodes_from_ends(tree)
     if episodes:
@@ -64,10 +65,10 @@ def find_episodes(tree: Tree) -> list[Episode]:
     groups: list[str] = []
     for group in tree.members("")[1]:  # the groups of recordings are here or one level below
         groups += [group] if _is_numbered(group) else filter(_is_numbered, tree.members(group)[1])
+    if not groups:
+        return [Episode(None)]
     names = Counter(group.rpartition("/")[2] for group in groups)
-    return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=_natural_order)] or [
-        Episode(None)
-    ]
+    return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=_natural_order)]
 
 
 def _is_numbered(group: str) -> bool:
@@ -81,7 +82,10 @@ def _episode_name(group: str, names: Mapping[str, int]) -> str:
 
 
 def find_episode(tree: Tree, name: str | None) -> Episode:
-    """Return the recording with this name without reading the others. Raises `TacpipeError` if there is none."""
+    """Return the recording with this name, or the only one for None, without reading the others.
+
+    Raises `TacpipeError` if there is no such recording.
+    """
     if name is None:
         (*others, episode) = find_episodes(tree)
         if others or episode.name is not None:
@@ -91,10 +95,11 @@ def find_episode(tree: Tree, name: str | None) -> Episode:
     for episode in delimited:
         if episode.name == name:
             return episode
-    for group in ["", *(tree.members("")[1] if "/" not in name else ())] if not delimited else ():
-        path = f"{group}/{name}" if group else name
-        if tree.is_group(path):
-            return Episode(name, path)
+    if not delimited:
+        for group in ["", *(tree.members("")[1] if "/" not in name else ())]:
+            path = f"{group}/{name}" if group else name
+            if tree.is_group(path):
+                return Episode(name, path)
     raise TacpipeError(f"{tree.path} holds no recording {plain(name)}.")
 
 
@@ -109,12 +114,12 @@ def _episodes_from_ends(tree: Tree) -> list[Episode]:
         )
         if array is not None:
             ends = [int(end) for end in _read_ends(tree, array)]
-            about = tree.attributes(group)
-            names, names_stated = about.get(NAMES), True
+            attributes = tree.attributes(group)
+            names, has_names = attributes.get(NAMES), True
             if not isinstance(names, list) or len({str(name) for name in names}) != len(ends):
                 names = [f"episode_{number:06d}" for number in range(len(ends))]  # LeRobot's names
-                names_stated = False
-            labels = about.get(LABELS)
+                has_names = False
+            labels = attributes.get(LABELS)
             return [
                 Episode(
                     name=str(name),
@@ -125,7 +130,7 @@ def _episodes_from_ends(tree: Tree) -> list[Episode]:
                     total=ends[-1],
                     ends_group=group,
                     labels=_labels_of_episode(labels, str(name)),
-                    name_is_stated=names_stated,
+                    name_is_stated=has_names,
                 )
                 for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
             ]
@@ -138,6 +143,7 @@ def _labels_of_episode(labels: Any, name: str) -> StoredAttributes:
 
 
 def _read_ends(tree: Tree, array: ArrayDescription) -> AnyArray:
+    """Return the end rows of recordings. Raises `TacpipeError` if the array cannot be read or does not increase."""
     if array.problem:
         raise TacpipeError(f"{tree.path}: {array.path} {array.problem}.")
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
@@ -203,20 +209,23 @@ class StreamParts:
 
 
 def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
-    """Return the streams of a recording in the file's order."""
+    """Group the arrays of a recording into streams, in the file's order.
+
+    Arrays that are neither streams nor skipped are single values of the recording.
+    """
     parts: list[StreamArrays] = []
     scalars: list[ArrayDescription] = []
     skipped: dict[str, str] = {}
     # timestamps in parent groups, used for arrays of the same length without their own
-    stamps: list[ArrayDescription] = []
+    parent_stamps: list[ArrayDescription] = []
     for group, arrays in walk(tree, episode.group):
-        inside = episode.inside(group)
-        if inside.rpartition("/")[2] == NEXT:
-            skipped[inside] = "repeats obs, one step later"
+        relative_group = episode.inside(group)
+        if relative_group.rpartition("/")[2] == NEXT:
+            skipped[relative_group] = "repeats obs, one step later"
         columns_of_group: list[ArrayDescription] = []
         for array in arrays:
             reason = _reason_left_out(array, episode)
-            if NEXT in inside.split("/"):
+            if NEXT in relative_group.split("/"):
                 continue
             if reason:
                 skipped[episode.inside(array.path)] = reason
@@ -224,8 +233,8 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
                 scalars += [array] if array.path not in ENDS else []
             else:
                 (columns_of_group if _is_column(array, arrays, episode) else scalars).append(array)
-        parts += _divide_by_length(columns_of_group, inside or ROOT, episode, stamps)
-        stamps += filter(_is_time, columns_of_group)
+        parts += _divide_by_length(columns_of_group, relative_group or ROOT, episode, parent_stamps)
+        parent_stamps += filter(_is_time, columns_of_group)
     return StreamParts(parts, scalars, skipped)
 
 
@@ -233,11 +242,12 @@ def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
     """Return the reason why an array is skipped, or an empty string."""
     if array.name == LENGTHS:
         return "holds the lengths of padded frames"
-    one_each = array.group == episode.ends_group and array.shape == (episode.count,)
-    short = episode.stop is not None and not one_each and array.shape[:1] < (episode.total,)
-    return reason_left_out(array) or (
-        f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else ""
-    )
+    is_one_per_recording = array.group == episode.ends_group and array.shape == (episode.count,)
+    if reason := reason_left_out(array):
+        return reason
+    if episode.stop is not None and not is_one_per_recording and array.shape[:1] < (episode.total,):
+        return f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings"
+    return ""
 
 
 def _is_column(array: ArrayDescription, neighbours: Sequence[ArrayDescription], episode: Episode) -> bool:
@@ -247,9 +257,13 @@ def _is_column(array: ArrayDescription, neighbours: Sequence[ArrayDescription], 
 
 
 def _divide_by_length(
-    arrays: Sequence[ArrayDescription], group: str, episode: Episode, above: Sequence[ArrayDescription]
+    arrays: Sequence[ArrayDescription], group: str, episode: Episode, parent_clocks: Sequence[ArrayDescription]
 ) -> Iterator[StreamArrays]:
-    """Yield one stream per array length. A group's only stream has the group's name, others that of their first array."""
+    """Yield one stream per array length, and one per array of images or of structures.
+
+    A group's only stream has the group's name, others that of their first array. ``above`` are the timestamps in parent
+    groups.
+    """
     single_streams = [
         array
         for array in arrays
@@ -259,33 +273,38 @@ def _divide_by_length(
     for array in arrays:
         if array not in single_streams:
             by_length.setdefault(array.shape[0], []).append(array)
-    is_divided = sum(any(not _is_time(array) for array in same) for same in by_length.values()) > 1
-    for same in by_length.values():
-        time = _clock_array(same, above)
-        columns = [array for array in same if array is not time]
+    is_divided = sum(any(not _is_time(array) for array in same_length) for same_length in by_length.values()) > 1
+    for same_length in by_length.values():
+        time = _clock_array(same_length, parent_clocks)
+        columns = [array for array in same_length if array is not time]
         if columns:
             named_by_array = is_divided or (group == ROOT and len(columns) == 1)
             yield StreamArrays(episode.inside(columns[0].path) if named_by_array else group, columns, time)
     for array in single_streams:
         time = _clock_array(
-            by_length.get(array.shape[0], []), [clock for clock in above if clock.shape[0] == array.shape[0]]
+            by_length.get(array.shape[0], []), [clock for clock in parent_clocks if clock.shape[0] == array.shape[0]]
         )
         is_picture = is_frames(array) or pixel_format(array) is not None
         yield StreamArrays(episode.inside(array.path), [array], time, is_picture)
 
 
-def _clock_array(same: Sequence[ArrayDescription], above: Sequence[ArrayDescription]) -> ArrayDescription | None:
-    """Return the timestamps for arrays of one length: one of them, or an array in a parent group."""
-    clocks = [array for array in same if _is_time(array)]
+def _clock_array(
+    same_length: Sequence[ArrayDescription], parent_clocks: Sequence[ArrayDescription]
+) -> ArrayDescription | None:
+    """Return the timestamps for arrays of one length: one of them, or an array in a parent group; None if there are none."""
+    clocks = [array for array in same_length if _is_time(array)]
     clock = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
-    length = same[0].shape[0] if same else None
-    return clock or next((array for array in reversed(above) if length is None or array.shape[0] == length), None)
+    length = same_length[0].shape[0] if same_length else None
+    return clock or next(
+        (array for array in reversed(parent_clocks) if length is None or array.shape[0] == length), None
+    )
 
 
 def _is_time(array: ArrayDescription) -> bool:
-    narrow = len(array.shape) == 1 or array.shape[1:] == (1,)
+    """Return whether an array contains timestamps, by its name, shape and type."""
+    is_column = len(array.shape) == 1 or array.shape[1:] == (1,)
     return (
-        narrow
+        is_column
         and array.dtype.kind in "iuf"
         and (TIME.fullmatch(array.name) is not None or SENSOR_TIME.fullmatch(array.name) is not None)
     )
@@ -302,9 +321,10 @@ MIN_UNIX_S = 1e8  # Unix time in seconds; smaller values count from the start of
 
 
 def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
-    """Return the source of a stream's timestamps, or an empty `Time` if the file has neither timestamps nor a rate."""
+    """Return how a stream is timed: by a column of timestamps or a rate, or an empty `Time` if the file has neither."""
     if part.clock:
-        unit = _stamp_unit(part, size := _last_stamp(tree, episode, part))
+        size = _last_stamp(tree, episode, part)
+        unit = _stamp_unit(part, size)
         if unit is not None:
             declared = part.time is not None and part.time.attributes.get("quantity") == "time"
             since_1970 = declared or size >= MIN_UNIX_S * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
@@ -339,24 +359,30 @@ def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
 
 
 def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
-    """Return the unit of timestamps from an attribute, the name or the magnitude; None if it is unknown."""
+    """Return the unit of timestamps from an attribute, the name or the magnitude; None if it is unknown.
+
+    ``size`` is the absolute value of a timestamp.
+    """
     attributes = part.time.attributes if part.time is not None else {}
     declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
     suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)
     unit = UNITS.get(declared.strip().lower()) or (UNITS.get(suffix[1].lower()) if suffix else None)
-    return unit or (next(unit for limit, unit in SINCE_1970 if size < limit) if size >= MIN_UNIX_S else None)
+    if unit is None and size >= MIN_UNIX_S:
+        return next(unit for limit, unit in SINCE_1970 if size < limit)
+    return unit
 
 
 def declared_rate_hz(tree: Tree, episode: Episode, part: StreamArrays | None) -> float | None:
     """Return the rate declared by a stream's arrays, its group, a parent group, or all recordings; None if there is none."""
     arrays = part.arrays if part is not None else ()
     groups = [*reversed(parent_groups(arrays[0].group))] if arrays else []
-    attribute_sets = [*(attributes.attributes for attributes in arrays), *map(tree.attributes, groups)]
+    attribute_sets = [*(array.attributes for array in arrays), *map(tree.attributes, groups)]
     attribute_sets += [tree.attributes(episode.ends_group)] if episode.ends_group is not None else []
     return next((rate for attributes in attribute_sets if (rate := _declared_rate(attributes)) is not None), None)
 
 
 def _declared_rate(attributes: StoredAttributes) -> float | None:
+    """Return the rate in Hz in the attributes of an array or group, or None if they have none."""
     for name in RATES:
         value = attributes.get(name)
         if isinstance(value, int | float | np.number) and np.isfinite(value) and 0 < value <= 1e9:

@@ -49,10 +49,10 @@ class Hdf5Tree:
         return [f"{self.path} is cut short after {self._available:,} bytes, and the rest is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
-        """Return the arrays and the paths of the groups in a group."""
+        """Return the arrays in a group, and the paths of the groups in it."""
         if group in self._members:
             return self._members[group]
-        arrays, below = [], []
+        arrays, subgroups = [], []
         with self._convert_read_errors(group or "its root"):
             parent = self._file[group or "/"]
             for name in self._names(parent):
@@ -66,8 +66,8 @@ class Hdf5Tree:
                 if isinstance(member, ArrayDescription):
                     arrays.append(member)
                 elif member:
-                    below.append(member)
-        self._members[group] = with_time_first(arrays), below
+                    subgroups.append(member)
+        self._members[group] = with_time_first(arrays), subgroups
         return self._members[group]
 
     def is_group(self, path: str) -> bool:
@@ -87,17 +87,17 @@ class Hdf5Tree:
         """Return the rows of an array, text as ``str`` objects. Raises `TacpipeError` if they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
         limit_bytes = memory.MAX_BLOCK_BYTES + array.row_bytes * max(stop - start, 1) * 4
-        place = f"{self.path}, {plain(array.path, 200)},"
+        subject = f"{self.path}, {plain(array.path, 200)},"
         with (
-            memory.bounded(limit_bytes, place) if array.dtype.hasobject else contextlib.nullcontext(),
+            memory.bounded(limit_bytes, subject) if array.dtype.hasobject else contextlib.nullcontext(),
             self._convert_read_errors(array.path),
         ):
             dataset = self._file[array.path]
             if self._available is not None:
                 _expect_within_file(dataset, self._available)
-            text = h5py.check_string_dtype(dataset.dtype) is not None
+            is_text = h5py.check_string_dtype(dataset.dtype) is not None
             rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
-            values = (dataset.asstr(errors="replace") if text else dataset)[rows]
+            values = (dataset.asstr(errors="replace") if is_text else dataset)[rows]
             return np.moveaxis(np.asarray(values), array.time_axis, 0) if array.shape else np.asarray(values)
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> None:
@@ -107,7 +107,7 @@ class Hdf5Tree:
         """Return None, because the file itself contains the encoding."""
 
     @contextlib.contextmanager
-    def _convert_read_errors(self, place: str) -> Iterator[None]:
+    def _convert_read_errors(self, subject: str) -> Iterator[None]:
         """Convert errors of h5py in the block to a `TacpipeError` with the file and the path in it."""
         try:
             yield
@@ -117,10 +117,10 @@ class Hdf5Tree:
                     raise
             if self._available is not None:
                 cut = f"{self.path} is cut short after {self._available:,} bytes"
-                raise TacpipeError(f"{cut}, and {plain(place, 200)} lies behind. Copy it again.") from error
+                raise TacpipeError(f"{cut}, and {plain(subject, 200)} lies behind. Copy it again.") from error
             reason = plain(str(error.args[0] if error.args else error), 200)
             raise TacpipeError(
-                f"{self.path}: {plain(place, 200)} cannot be read: {reason}. Copy the file again."
+                f"{self.path}: {plain(subject, 200)} cannot be read: {reason}. Copy the file again."
             ) from error
 
     def _names(self, group: h5py.Group) -> list[str]:
@@ -128,9 +128,9 @@ class Hdf5Tree:
         if self._available is None:
             return list(group)
         names: list[bytes] = []
-        place = group.id  # keeps the group open while its links are listed
+        group_id = group.id  # keeps the group open while its links are listed
         with contextlib.suppress(*BROKEN):
-            place.links.iterate(names.append)  # iteration continues while the callback returns None
+            group_id.links.iterate(names.append)  # iteration continues while the callback returns None
         return [name.decode(errors="surrogateescape") for name in names]
 
     def identity(self, group: str) -> Any:
@@ -205,6 +205,7 @@ class _PaddedFile(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
+        """Read into ``buffer``; bytes beyond the end of the truncated file read as zeros. Return the number of bytes."""
         count = max(0, min(len(buffer), self._size - self._at))
         self._file.seek(min(self._at, self._available))
         content = self._file.read(count)
@@ -229,7 +230,10 @@ def _expect_within_file(dataset: h5py.Dataset, available: int) -> None:
 
 
 def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescription | str:
-    """Return an array, the path of a group, or an empty string for any other member."""
+    """Return an array, the path of a group, or "" for any other member.
+
+    An array that is not read has the reason in ``problem``.
+    """
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
         return ArrayDescription(
@@ -268,9 +272,10 @@ def _filters(dataset: h5py.Dataset) -> Iterator[int]:
 
 
 def _read_attributes(owner: Any, file: Path) -> StoredAttributes:
+    """Return the attributes of a group or array; those that numpy cannot represent are left out."""
     attributes: dict[str, StoredValue] = {}
     for name in owner.attrs:
-        place = f"{file}, the attribute {plain(name)},"
-        with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, place):  # numpy lacks some types
+        subject = f"{file}, the attribute {plain(name)},"
+        with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, subject):  # numpy lacks some types
             attributes[str(name)] = owner.attrs[name]
     return attributes

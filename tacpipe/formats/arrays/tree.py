@@ -108,7 +108,7 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
     """
     lengths = {array.shape[0] for array in arrays if len(array.shape) == 1 and array.shape[0] > 1}
     firsts = [array.shape[0] for array in arrays if array.shape]
-    turned = []
+    described = []
     for array in arrays:
         axis = 0
         if (
@@ -119,19 +119,23 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
         ):
             matching = [axis for axis, length in enumerate(array.shape) if length in lengths]
             longest = array.shape.index(max(array.shape))
-            small = (
+            is_small = (
                 firsts.count(array.shape[0]) == 1
                 and array.shape[0] < 100
                 and array.shape[longest] >= 4 * array.shape[0]
             )
-            axis = matching[0] if matching else longest if small else 0
+            axis = longest if is_small else 0
+            axis = matching[0] if matching else axis
         shape = (array.shape[axis], *array.shape[:axis], *array.shape[axis + 1 :]) if array.shape else ()
-        turned.append(replace(array, shape=shape, time_axis=axis, chunk_rows=0 if axis else array.chunk_rows))
-    return turned
+        described.append(replace(array, shape=shape, time_axis=axis, chunk_rows=0 if axis else array.chunk_rows))
+    return described
 
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescription]]]:
-    """Yield ``group`` and each group below it with its arrays. An array with several paths is marked with a problem."""
+    """Yield ``group`` and each group below it, with its arrays.
+
+    A group with several paths is walked once; at its other paths, one array with a problem stands for it.
+    """
     first_paths: dict[Any, str] = {}
     pending = [group]
     while pending:
@@ -141,9 +145,9 @@ def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescripti
             problem = f"is the group {plain(first) or '/'}, which is read there"
             yield path.rpartition("/")[0], [ArrayDescription(path, (), np.dtype("V"), problem=problem)]
             continue
-        arrays, below = tree.members(path)
+        arrays, subgroups = tree.members(path)
         yield path, arrays
-        pending += reversed(below)
+        pending += reversed(subgroups)
 
 
 def is_frames(array: ArrayDescription) -> bool:
@@ -180,7 +184,7 @@ def is_image(array: ArrayDescription) -> bool:
 
 
 def reason_left_out(array: ArrayDescription) -> str:
-    """Return why an array is not read as columns, as in "NAME …", or an empty string if it is.
+    """Return the reason why an array is not read as columns, without its name; an empty string if it is read.
 
     >>> reason_left_out(ArrayDescription("a/cam", (5, 480, 640, 3), np.dtype("float32")))
     'holds decoded pictures (480 x 640 x 3) of float32; uint8 and, without colours, uint16 are read'
@@ -218,15 +222,14 @@ def plain_attributes(attributes: StoredAttributes) -> dict[str, str | int | floa
     {'a': 0.5, 'b': 'x', 'd': 3}
     """
     values: dict[str, str | int | float | bool] = {}
-    for name, value in attributes.items():
-        if isinstance(value, np.ndarray) and value.size == 1:
-            value = value.reshape(-1)[0]
+    for name, stored in attributes.items():
+        value: Any = stored.reshape(-1)[0] if isinstance(stored, np.ndarray) and stored.size == 1 else stored
         if isinstance(value, np.generic):
             value = value.item()
         if isinstance(value, bytes):
             value = value.decode(errors="replace")
-        finite = not isinstance(value, float) or math.isfinite(value)
-        if isinstance(value, str | int | float | bool) and finite and len(str(value)) <= MAX_TEXT:
+        is_finite = not isinstance(value, float) or math.isfinite(value)
+        if isinstance(value, str | int | float | bool) and is_finite and len(str(value)) <= MAX_TEXT:
             values[plain(str(name))] = value
     return values
 
@@ -239,7 +242,7 @@ MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # image f
 
 
 def picture_encoding(content: bytes) -> str:
-    r"""Return the encoding of a picture by its first bytes, or empty if it is none of these.
+    r"""Return the encoding of a picture by its first bytes, or an empty string if it is none of `MAGIC`.
 
     >>> picture_encoding(b"\xff\xd8\xff\xe0"), picture_encoding(b"abc")
     ('jpeg', '')
@@ -317,15 +320,16 @@ def read_transposed(tree: Tree, array: ArrayDescription, start: int, stop: int) 
     return block
 
 
-def _compound_columns(before: str, values: AnyArray, array: ArrayDescription) -> Iterator[tuple[pa.Field, pa.Array]]:
+def _compound_columns(prefix: str, values: AnyArray, array: ArrayDescription) -> Iterator[tuple[pa.Field, pa.Array]]:
+    """Yield field and values of each column of a compound array; names of nested fields start with ``before``."""
     for name in values.dtype.names or ():
         inner = values[name]
         if inner.dtype.names is not None:
-            yield from _compound_columns(f"{before}{name}.", inner, array)
+            yield from _compound_columns(f"{prefix}{name}.", inner, array)
         else:
             flat = inner.reshape(len(inner), -1).T if inner.size else inner.reshape(int(np.prod(inner.shape[1:])), 0)
             yield from _value_columns(
-                f"{before}{name}", flat, inner.shape[1:], array, f"{array.path}/{before}{name}", None
+                f"{prefix}{name}", flat, inner.shape[1:], array, f"{array.path}/{prefix}{name}", None
             )
 
 
@@ -337,7 +341,10 @@ def _value_columns(
     path: str,
     meanings: list[ColumnMeaning] | None,
 ) -> Iterator[tuple[pa.Field, pa.Array]]:
-    """Yield the columns of values (value, row) whose rows have this shape."""
+    """Yield field and values of each column of ``flat`` (value, row), an array whose rows have this ``shape``.
+
+    ``path`` is used to infer the meanings of columns if ``meanings`` is None.
+    """
     width = len(flat)
     declared = column_names.declared_metadata(array.attributes)
     about = meanings or column_names.meanings(path, width, flat.dtype.kind in "iub")
@@ -346,20 +353,21 @@ def _value_columns(
     if "quantity" in declared:  # an array with a declared quantity has no other meanings
         about = [column_names.NO_MEANING] * width
     components = [meaning.component for meaning in about]
-    names, units = (
-        column_names.declared_texts(array.attributes, "columns", width),
-        column_names.declared_texts(array.attributes, "units", width),
-    )
-    flat = _native_values(flat, array)
+    names = column_names.declared_texts(array.attributes, "columns", width)
+    units = column_names.declared_texts(array.attributes, "units", width)
+    has_components = all(components) and len(set(components)) == width > 1
+    native = _native_values(flat, array)
     for position, at in enumerate(np.ndindex(*shape)):
         meaning = about[position]
         metadata = {"quantity": meaning.quantity, "unit": meaning.unit, "component": meaning.component} | declared
         metadata |= {"unit": units[position]} if units else {}
         metadata |= _taxel_and_axis(metadata["quantity"], shape, at)
-        suffix = meaning.component if all(components) and len(set(components)) == width > 1 else "_".join(map(str, at))
-        called = names[position] if names else f"{name}_{suffix}" if width > 1 else name
-        column = _column_array(flat[position], array)
-        yield pa.field(called, column.type, metadata={key: value for key, value in metadata.items() if value}), column
+        suffix = meaning.component if has_components else "_".join(map(str, at))
+        column_name = f"{name}_{suffix}" if width > 1 else name
+        column_name = names[position] if names else column_name
+        column = _column_array(native[position], array)
+        metadata = {key: value for key, value in metadata.items() if value}
+        yield pa.field(column_name, column.type, metadata=metadata), column
 
 
 def _taxel_and_axis(quantity: str, shape: tuple[int, ...], at: tuple[int, ...]) -> dict[str, str]:
@@ -389,6 +397,7 @@ def _native_values(values: AnyArray, array: ArrayDescription) -> AnyArray:
 
 
 def _column_array(values: Any, array: ArrayDescription) -> pa.Array:
+    """Return one column of an array: images, text or numbers."""
     if values.dtype.kind == "O" and is_frames(array):
         return picture_array(array, values)
     if values.dtype.kind in "SUOT":

@@ -112,9 +112,9 @@ class ZarrTree:
     def read(self, array: ArrayDescription, start: int, stop: int) -> AnyArray:
         """Return the rows of an array. Raises `TacpipeError` for damaged and for missing chunks."""
         zarr = _library()
-        stop = min(stop, array.shape[0]) if array.shape else 1
-        memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        chunks = self.chunks(array, start, stop)
+        end = min(stop, array.shape[0]) if array.shape else 1
+        memory.require(array.row_bytes * max(end - start, 0), f"{self.path}, {plain(array.path, 200)},")
+        chunks = self.chunks(array, start, end)
         lost = [name for name in chunks if not self._has(name)]
         for name in chunks if self.names is None else ():
             if name not in lost:
@@ -131,15 +131,15 @@ class ZarrTree:
             with contextlib.ExitStack() as stack, self._store() as store:
                 zarr_array = zarr.open_array(store, path=array.path, mode="r")
                 chunk_bytes = math.prod(zarr_array.chunks) * max(array.dtype.itemsize, 1)
-                limit_bytes = UNPACKED_BYTES + array.row_bytes * max(stop - start, 1) + 4 * chunk_bytes
+                limit_bytes = UNPACKED_BYTES + array.row_bytes * max(end - start, 1) + 4 * chunk_bytes
                 stack.enter_context(memory.bounded(limit_bytes, f"{self.path}, {plain(array.path, 200)},"))
-                return np.asarray(zarr_array[() if not array.shape else slice(start, stop)])
+                return np.asarray(zarr_array[() if not array.shape else slice(start, end)])
         except BROKEN as error:
             if isinstance(error, OSError) and error.errno is not None:
                 with regular.failing(self.path):
                     raise
             raise TacpipeError(
-                f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {stop}, cannot be read: "
+                f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {end}, cannot be read: "
                 f"{plain(str(error), 200)}. Copy the store again."
             ) from error
 
@@ -201,28 +201,31 @@ class ZarrTree:
         return self._nodes[path]
 
     def _read_node(self, path: str) -> ZarrNode | None:
+        """Return the metadata and attributes of an array or group, or None if the path is neither."""
         for mark in MARKS:
             name = f"{path}/{mark}" if path else mark
             if self._has(name):
-                about = self._json(name)
+                about = self._read_json(name)
                 if mark == MARKS[-1]:
                     attributes = about.get("attributes", {})
                 else:
                     attributes_name = f"{path}/.zattrs" if path else ".zattrs"
-                    attributes = self._json(attributes_name) if self._has(attributes_name) else {}
+                    attributes = self._read_json(attributes_name) if self._has(attributes_name) else {}
                 return ZarrNode(about, attributes if isinstance(attributes, dict) else {})
         return None
 
-    def _json(self, name: str) -> Any:
+    def _read_json(self, name: str) -> Any:
+        """Return the JSON object in a file of the store. Raises `TacpipeError` if it is none."""
         try:
-            content = json.loads(self._content(name))
+            content = json.loads(self._read_metadata(name))
         except (*BROKEN_ZIP, RecursionError) as error:
             raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
         if not isinstance(content, dict):
             raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(content)}; it must be a JSON object.")
         return content
 
-    def _content(self, name: str) -> bytes:
+    def _read_metadata(self, name: str) -> bytes:
+        """Return the content of a metadata file. Raises `TacpipeError` if it is too large."""
         if self.names is None:
             path = regular.inside(self.path, name)
             with regular.failing(path):
@@ -235,6 +238,7 @@ class ZarrTree:
 
     @contextlib.contextmanager
     def _store(self) -> Iterator[Any]:
+        """Open the store with the library zarr in the block."""
         storage = _library().storage
         if self.names is None:
             yield storage.LocalStore(self.path, read_only=True)
@@ -300,6 +304,7 @@ def _library() -> Any:
 
 @contextlib.contextmanager
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open a zip file in the block. Raises `zipfile.BadZipFile` if it is damaged."""
     with regular.failing(path):
         file = regular.opened(path)
     with file:
@@ -313,57 +318,61 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error
 
 
-def _parse_array(path: str, about: ZarrMetadata, attributes: StoredAttributes) -> ArrayDescription:
+def _parse_array(path: str, metadata: ZarrMetadata, attributes: StoredAttributes) -> ArrayDescription:
+    """Return an array from its metadata; one that is not read has the reason in ``problem``."""
     problem = ""
-    shape = about.get("shape")
+    shape = metadata.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
         return ArrayDescription(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
     try:
-        kind = _parse_dtype(about)
+        dtype = _parse_dtype(metadata)
     except (TypeError, ValueError, LookupError, AttributeError):
-        kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}"
+        dtype, problem = np.dtype("V"), f"has the type {excerpt(metadata.get('dtype', metadata.get('data_type')))}"
     try:
-        steps, _ = _chunk_grid(about)
+        steps, _ = _chunk_grid(metadata)
     except (TypeError, ValueError, LookupError, AttributeError):
         steps = []
     if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
         problem, steps = "has chunks of no known shape", []
     try:
-        codecs = {str(codec) for codec in _codec_names(about)}
+        codecs = {str(codec) for codec in _codec_names(metadata)}
     except (TypeError, AttributeError):
         codecs = {"unnamed"}
-    if math.prod(steps) * kind.itemsize > memory.MAX_BLOCK_BYTES and "sharding_indexed" not in codecs:
-        problem = f"has chunks of {memory.readable_size(math.prod(steps) * kind.itemsize)}"
+    if math.prod(steps) * dtype.itemsize > memory.MAX_BLOCK_BYTES and "sharding_indexed" not in codecs:
+        problem = f"has chunks of {memory.readable_size(math.prod(steps) * dtype.itemsize)}"
     if unknown := sorted(codecs - CODECS):
         problem = f"is stored with the codec {excerpt(unknown[0])}"
-    elif kind.hasobject and kind.metadata is None:
+    elif dtype.hasobject and dtype.metadata is None:
         problem = "holds Python objects"
     reason = f"{problem}, which is not read" if problem else ""
-    return ArrayDescription(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
+    return ArrayDescription(path, tuple(shape), dtype, attributes, steps[0] if steps else 0, reason)
 
 
-def _parse_dtype(about: ZarrMetadata) -> np.dtype[Any]:
-    if about.get("zarr_format") == 3:
-        called = about["data_type"]
-        if called in ("string", "variable_length_utf8"):
+def _parse_dtype(metadata: ZarrMetadata) -> np.dtype[Any]:
+    """Return the numpy type of an array. Raises `TypeError` or another error of lookup if there is none."""
+    if metadata.get("zarr_format") == 3:
+        type_name = metadata["data_type"]
+        if type_name in ("string", "variable_length_utf8"):
             return np.dtype("O", metadata={"vlen": str})
-        if not _KINDS.fullmatch(called):
-            raise TypeError(called)
-        return np.dtype(str(called))
-    kind: Any = about["dtype"]
+        if not _KINDS.fullmatch(type_name):
+            raise TypeError(type_name)
+        return np.dtype(str(type_name))
+    kind: Any = metadata["dtype"]
     if kind == "|O":
-        texts = [entry.get("id") for entry in about.get("filters") or ()]
-        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})
+        filter_names = [entry.get("id") for entry in metadata.get("filters") or ()]
+        return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in filter_names else {})
     dtype: np.dtype[Any] = np.dtype([tuple(entry) for entry in kind] if isinstance(kind, list) else kind)
     return dtype
 
 
-def _codec_names(about: ZarrMetadata) -> Iterator[Any]:
+def _codec_names(metadata: ZarrMetadata) -> Iterator[Any]:
     """Yield the codec names of an array, without the prefix of codecs from numcodecs."""
-    if about.get("zarr_format") != 3:
-        yield from (_entry(codec, "id") for codec in (about.get("compressor"), *(about.get("filters") or ())) if codec)
+    if metadata.get("zarr_format") != 3:
+        yield from (
+            _entry(codec, "id") for codec in (metadata.get("compressor"), *(metadata.get("filters") or ())) if codec
+        )
         return
-    pending = list(about.get("codecs") or ())
+    pending = list(metadata.get("codecs") or ())
     while pending:
         codec = pending.pop()
         name = _entry(codec, "name")
@@ -377,13 +386,13 @@ def _entry(codec: Any, key: str) -> Any:
     return codec.get(key) if isinstance(codec, dict) else codec
 
 
-def _chunk_grid(about: ZarrMetadata) -> tuple[Sequence[int], Any]:
-    """Return the shape of a chunk, and a function from its grid position to its name in the array."""
-    if about.get("zarr_format") == 3:
-        encoding: Any = about.get("chunk_key_encoding", {"name": "default"})
-        between = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
-        before = ["c"] if encoding["name"] == "default" else []
-        shape = about["chunk_grid"]["configuration"]["chunk_shape"]
-        return list(shape), lambda at: between.join([*before, *map(str, at)]) or "0"
-    between = about.get("dimension_separator") or "."
-    return list(about["chunks"]), lambda at: between.join(map(str, at)) or "0"
+def _chunk_grid(metadata: ZarrMetadata) -> tuple[Sequence[int], Any]:
+    """Return the shape of a chunk, and a function from its position in the grid to its name in the array."""
+    if metadata.get("zarr_format") == 3:
+        encoding: Any = metadata.get("chunk_key_encoding", {"name": "default"})
+        separator = encoding.get("configuration", {}).get("separator", "/" if encoding["name"] == "default" else ".")
+        prefix = ["c"] if encoding["name"] == "default" else []
+        shape = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        return list(shape), lambda at: separator.join([*prefix, *map(str, at)]) or "0"
+    separator = metadata.get("dimension_separator") or "."
+    return list(metadata["chunks"]), lambda at: separator.join(map(str, at)) or "0"

@@ -47,24 +47,24 @@ class ExportedStream:
 
 def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
     """Return the stream that a channel's metadata describe, or None if tacpipe did not write them."""
-    metadata_json = _json_object(metadata.get(EXPORT_KEY, ""))
-    if "derived_from" in metadata_json:
+    description = _json_object(metadata.get(EXPORT_KEY, ""))
+    if "derived_from" in description:
         return ExportedStream("", True, {}, {})
     try:
         columns = {
-            str(column["field"]): (str(column["name"]), _texts(column["about"])) for column in metadata_json["columns"]
+            str(column["field"]): (str(column["name"]), _texts(column["about"])) for column in description["columns"]
         }
-        return ExportedStream(str(metadata_json["stream"]), False, columns, _texts(metadata_json.get("time", {})))
+        return ExportedStream(str(description["stream"]), False, columns, _texts(description.get("time", {})))
     except (KeyError, TypeError, AttributeError):
         return None
 
 
 def exported_attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
-    """Return the attributes in the metadata record."""
-    metadata_json = _json_object(values.get("attributes", ""))
+    """Return the attributes in the metadata record ``values`` of an export."""
+    attributes = _json_object(values.get("attributes", ""))
     return {
         str(name): value
-        for name, value in metadata_json.items()
+        for name, value in attributes.items()
         if value is None or isinstance(value, str | int | float | bool)
     }
 
@@ -85,14 +85,15 @@ def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStre
             fields[column.name] = column
     schema = pa.schema(list(fields.values()))
 
-    def renamed(table: pa.Table) -> pa.Table:
+    def rename(table: pa.Table) -> pa.Table:
         return pa.table([table.column(name) for name in fields], schema)
 
-    content = stream.content.mapped(schema, renamed) if isinstance(stream.content, Batched) else renamed(stream.content)
+    content = stream.content.mapped(schema, rename) if isinstance(stream.content, Batched) else rename(stream.content)
     return SourceStream(stream.source, stream.name, Time(HEADER, "ns"), content, stream.rows)
 
 
 def _json_object(text: str) -> Values:
+    """Return the JSON object in a text, or an empty object if it is none."""
     try:
         value = json.loads(text or "{}")
     except (ValueError, RecursionError):
@@ -133,6 +134,7 @@ class Bag:
         return self._read(sources, None)
 
     def _read(self, sources: Collection[str] | None, max_messages: int | None) -> EpisodeContents:
+        """Return the contents of the bag, of all or only the requested ``sources``, up to ``max_messages`` per file."""
         with contextlib.ExitStack() as stack:
             files, messages_compressed, notes = _bag_files(self.path, stack)
             reading = _BagReading(self.path, sources, messages_compressed)
@@ -149,11 +151,14 @@ def open_bag(path: Path) -> Bag:
 
 
 def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, list[str]]:
-    """Return the files of a bag in order, whether each message is compressed, and notes about the files."""
+    """Return the files of a bag in order, whether each message is compressed, and notes about the files.
+
+    ``stack`` keeps unpacked files. Raises `TacpipeError` if the bag has no files, or files of an unsupported storage.
+    """
     if not path.is_dir():
         return [_unpack_file(path, stack)], False, []
-    about = _bag_description(path / "metadata.yaml")
-    listing = about.get("relative_file_paths")
+    description = _read_description(path / "metadata.yaml")
+    listing = description.get("relative_file_paths")
     names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
     container.parts_by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
@@ -168,9 +173,9 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
     if not present_files:
         raise TacpipeError(f"{path} holds no file of a bag; its metadata.yaml names {listed(names, 3) or 'none'}.")
     if unsupported := [file.name for file in present_files if _file_ending(file) not in READERS]:
-        storage = excerpt(about.get("storage_identifier"))
+        storage = excerpt(description.get("storage_identifier"))
         raise TacpipeError(f"{path}: {plain(unsupported[0])} is of the storage {storage}; mcap and sqlite3 are read.")
-    compressed = str(about.get("compression_mode") or "").lower() == "message"
+    compressed = str(description.get("compression_mode") or "").lower() == "message"
     return [_unpack_file(file, stack) for file in present_files], compressed, notes
 
 
@@ -206,13 +211,14 @@ class BagDescription(TypedDict, total=False):
     relative_file_paths: list[str]
 
 
-def _bag_description(path: Path) -> BagDescription:
+def _read_description(path: Path) -> BagDescription:
+    """Return the description of a bag in its ``metadata.yaml``. Raises `TacpipeError` if it has none."""
     try:
         value = config_text.load_yaml(
             regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode()
         )
-        about = value["rosbag2_bagfile_information"]
-        return cast("BagDescription", dict(about))
+        description = value["rosbag2_bagfile_information"]
+        return cast("BagDescription", dict(description))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise TacpipeError(
             f"{path} does not describe a bag: {plain(str(error), 120)}. Without it the files next to it are read one by one."
@@ -220,7 +226,10 @@ def _bag_description(path: Path) -> BagDescription:
 
 
 def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
-    """Return ``path``, or the path of a temporary unpacked copy if it is a compressed database."""
+    """Return ``path``, or the path of a temporary unpacked copy if it is a compressed database.
+
+    Raises `TacpipeError` if it cannot be unpacked.
+    """
     if path.suffix.lower() != ZSTD or _file_ending(path) == ".mcap":
         return path
     import zstandard
@@ -260,18 +269,22 @@ class _BagReading:
         """Add the records of one file, up to ``max_messages`` messages."""
         for record in records:
             if isinstance(record, BagMessage):
-                self._message(record, file)
+                self._add_message(record, file)
                 if max_messages is not None and (max_messages := max_messages - 1) <= 0:
                     self.ended_early = True
                     return
             elif isinstance(record, TopicConnection):
-                self._channel(record, file)
+                self._add_channel(record, file)
             elif isinstance(record, Metadata):
-                self._metadata(record)
+                self._add_metadata(record)
             elif isinstance(record, BagDamage):
                 self.notes.append(record.text)
 
-    def _channel(self, channel: TopicConnection, file: int) -> None:
+    def _add_channel(self, channel: TopicConnection, file: int) -> None:
+        """Add a channel and its decoder, unless it is not requested or cannot be decoded.
+
+        Raises `TacpipeError` if the file describes the channel in two ways.
+        """
         topic = channel.topic
         before = self._described.setdefault((file, channel.number), channel)
         if before is not channel:  # chunks repeat channel descriptions
@@ -300,7 +313,8 @@ class _BagReading:
         except TopicError as error:
             self._skip(topic, str(error))
 
-    def _message(self, message: BagMessage, file: int) -> None:
+    def _add_message(self, message: BagMessage, file: int) -> None:
+        """Pass a message to the decoder of its topic; a topic with a message that cannot be decoded is skipped."""
         topic = self.topics.get(self._channels.get((file, message.channel), ""))
         if topic is None:
             self.undescribed += (file, message.channel) not in self._described
@@ -311,7 +325,8 @@ class _BagReading:
         except TopicError as error:
             self._skip(self._channels[file, message.channel], str(error))
 
-    def _metadata(self, metadata: Metadata) -> None:
+    def _add_metadata(self, metadata: Metadata) -> None:
+        """Add the attributes in a metadata record: of ROS 2, of an export of tacpipe, or of another program."""
         if metadata.name == ROS2_METADATA:
             if metadata.values.get("ros_distro"):
                 self.attributes["ros_distro"] = metadata.values["ros_distro"]
@@ -335,13 +350,13 @@ class _BagReading:
             if not reading.count:
                 continue
             try:
-                finished = reading.finish()
+                topic_streams = reading.finish()
             except TopicError as error:
                 self._skip(topic, str(error))
                 continue
-            if not finished:
+            if not topic_streams:
                 self.skipped[topic] = f"its messages ({plain(self.types[topic])}) hold no values"
-            for topic_stream in finished:
+            for topic_stream in topic_streams:
                 source = f"{topic}{SUFFIX_MARK}{topic_stream.suffix}" if topic_stream.suffix else topic
                 if self.sources is not None and source not in self.sources:
                     continue
@@ -375,6 +390,7 @@ class _BagReading:
 
 
 def _decompress_message(content: bytes) -> bytes:
+    """Return the content of a compressed message. Raises `TopicError` if it is damaged."""
     import zstandard
 
     try:

@@ -28,19 +28,22 @@ def declare_images(content: Batched, message_type: str) -> Batched:
     return _raw_images(content) if name in RAW else content
 
 
-def _add_metadata(content: Batched, metadata: dict[str, str], left_out: tuple[str, ...] = ()) -> Batched:
+def _add_metadata(content: Batched, metadata: dict[str, str], omitted_columns: tuple[str, ...] = ()) -> Batched:
     """Return rows with metadata at the images and without some columns."""
     fields = [
         field.with_metadata({**(field.metadata or {}), **metadata}) if field.name == PICTURE else field
         for field in content.schema
-        if field.name not in left_out
+        if field.name not in omitted_columns
     ]
     schema = pa.schema(fields)
     return content.mapped(schema, lambda table: pa.table([table.column(field.name) for field in fields], schema))
 
 
 def _raw_images(content: Batched) -> Batched:
-    """Return rows of raw images; unchanged if images differ in layout, or if their encoding cannot be decoded."""
+    """Return rows of raw images with their format as metadata and without padding.
+
+    Returns them unchanged if images differ in layout, or if their encoding cannot be decoded.
+    """
     present = [name for name in LAYOUT if name in content.schema.names]
     if not {"height", "width", "encoding", "step"} <= set(present):
         return content
@@ -64,7 +67,7 @@ def _raw_images(content: Batched) -> Batched:
     if step == row_bytes:
         return declared
 
-    def without_padding(table: pa.Table) -> pa.Table:
+    def remove_padding(table: pa.Table) -> pa.Table:
         images = [
             b"".join(image[start : start + row_bytes] for start in range(0, step * height, step))
             for image in table.column(PICTURE).to_pylist()
@@ -72,4 +75,4 @@ def _raw_images(content: Batched) -> Batched:
         at = table.schema.get_field_index(PICTURE)
         return table.set_column(at, table.schema.field(at), pa.array(images, pa.binary()))
 
-    return declared.mapped(declared.schema, without_padding)
+    return declared.mapped(declared.schema, remove_padding)

@@ -49,8 +49,8 @@ def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
     try:
         yield from _read_data(file, reader)
     except BrokenRecordError as error:
-        until = f"; {reader.count:,} messages up to {format_time(reader.last_ns)} were read" if reader.count else ""
-        yield BagDamage(f"{path}: {error}{until}.")
+        progress = f"; {reader.count:,} messages up to {format_time(reader.last_ns)} were read" if reader.count else ""
+        yield BagDamage(f"{path}: {error}{progress}.")
         return
     declared_count = _declared_message_count(file)
     lost = 0 if declared_count is None else declared_count - reader.count
@@ -59,7 +59,7 @@ def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
 
 
 def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
-    """Yield the records before the summary section."""
+    """Yield the records before the summary section. Raises `BrokenRecordError` if the file is truncated or damaged."""
     lost: LostChunk | None = None
     while True:
         kind, length = _read_head(file)
@@ -78,9 +78,9 @@ def _read_data(file: BinaryIO, reader: _RecordConverter) -> Iterator[Record]:
             if kind == MESSAGE_INDEX and lost is not None:
                 lost.count += max(len(content) - 6, 0) // INDEX_ENTRY
             elif kind == CHUNK:
-                lost = yield from reader.chunk(content, complete=len(content) == length)
+                lost = yield from reader.convert_chunk(content, complete=len(content) == length)
             elif len(content) == length:
-                yield from reader.record(kind, memoryview(content))
+                yield from reader.convert_record(kind, memoryview(content))
             if len(content) < length:
                 raise BrokenRecordError(CUT_OFF)
         else:  # an index, or an operation code of a later version
@@ -100,7 +100,10 @@ def _declared_message_count(file: BinaryIO) -> int | None:
 
 
 def _read_head(file: BinaryIO) -> tuple[int, int]:
-    """Return the operation code and the length in bytes of the next record."""
+    """Return the operation code and the length in bytes of the next record.
+
+    Raises `BrokenRecordError` at the end of the file.
+    """
     head = file.read(_RECORD.size)
     if len(head) < _RECORD.size:
         raise BrokenRecordError(CUT_OFF)
@@ -109,19 +112,24 @@ def _read_head(file: BinaryIO) -> tuple[int, int]:
 
 
 def _read_content(file: BinaryIO, length: int) -> bytes:
-    """Return the next ``length`` bytes, or fewer at the end of the file; a false ``length`` costs no memory."""
+    """Return the next ``length`` bytes, or fewer at the end of the file; a false ``length`` costs no memory.
+
+    Raises `BrokenRecordError` if ``length`` exceeds the memory limit.
+    """
     if length > memory.MAX_BLOCK_BYTES:
         raise BrokenRecordError(
             f"a record declares {length:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are read"
         )
     parts: list[bytes] = []
-    while length and (part := file.read(min(length, PIECE_BYTES))):
+    remaining = length
+    while remaining and (part := file.read(min(remaining, PIECE_BYTES))):
         parts.append(part)
-        length -= len(part)
+        remaining -= len(part)
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def _skip_bytes(file: BinaryIO, length: int) -> None:
+    """Skip ``length`` bytes. Raises `BrokenRecordError` if the file ends before."""
     if not length:
         return
     if length >= 1 << 62:
@@ -140,10 +148,13 @@ class _RecordConverter:
         self.last_ns = 0  # log time of the latest message
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
 
-    def record(self, kind: int, content: memoryview) -> Iterator[Record]:
-        """Yield the message, channel or metadata in a record; store a schema for later channels."""
+    def convert_record(self, kind: int, content: memoryview) -> Iterator[Record]:
+        """Yield the message, channel or metadata in a record; store a schema for later channels.
+
+        Raises `BrokenRecordError` if the record is damaged.
+        """
         if kind == MESSAGE:
-            yield self._message(content, 0, len(content))
+            yield self._convert_message(content, 0, len(content))
             return
         from mcap import records as mcap_records
         from mcap.data_stream import ReadDataStream
@@ -166,39 +177,40 @@ class _RecordConverter:
         except (EndOfFile, struct.error, UnicodeDecodeError) as error:
             raise BrokenRecordError(f"a record of kind {kind} is damaged") from error
 
-    def chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
-        """Yield the records of a chunk; a truncated chunk yields its complete records.
+    def convert_chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
+        """Yield the records of a chunk, or the complete ones of a truncated chunk.
 
-        Returns a lost chunk if a complete chunk is damaged, because none of its records can be trusted.
+        Returns a `LostChunk` if a complete chunk is damaged, because none of its records can be trusted, else None.
         """
         if len(content) < _CHUNK.size + 4:
             return LostChunk("has no whole header") if complete else None
         first_ns, last_ns, size, check = _CHUNK.unpack_from(content)
         (length,) = struct.unpack_from("<I", content, _CHUNK.size)
-        begin = _CHUNK.size + 4 + length
-        compression = bytes(content[_CHUNK.size + 4 : begin]).decode(errors="replace")
+        content_start = _CHUNK.size + 4 + length
+        compression = bytes(content[_CHUNK.size + 4 : content_start]).decode(errors="replace")
         if size > memory.MAX_BLOCK_BYTES:
             problem = f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
             return LostChunk(problem, first_ns, last_ns)
-        inside = _decompress(compression, content[begin + 8 :], size)
-        view = memoryview(inside)
+        unpacked = _decompress(compression, content[content_start + 8 :], size)
+        view = memoryview(unpacked)
         spans, end = _record_spans(view)
-        if complete and (len(inside) != size or end != size or (check and zlib.crc32(inside) != check)):
+        if complete and (len(unpacked) != size or end != size or (check and zlib.crc32(unpacked) != check)):
             return LostChunk(f"of {size:,} bytes is damaged", first_ns, last_ns)
-        for kind, at, length in spans:
+        for kind, offset, length in spans:
             if kind == MESSAGE:
-                yield self._message(view, at, length)
+                yield self._convert_message(view, offset, length)
             elif kind in (SCHEMA, CHANNEL):
-                yield from self.record(kind, view[at : at + length])
+                yield from self.convert_record(kind, view[offset : offset + length])
         return None
 
-    def _message(self, view: memoryview, at: int, length: int) -> BagMessage:
+    def _convert_message(self, view: memoryview, offset: int, length: int) -> BagMessage:
+        """Return the message of a record at an offset, and count it. Raises `BrokenRecordError` if it is too short."""
         if length < _MESSAGE.size:
             raise BrokenRecordError("a message record is too short")
-        number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
+        number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, offset)
         self.count += 1
         self.last_ns = log_ns
-        return BagMessage(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
+        return BagMessage(number, log_ns, publish_ns, bytes(view[offset + _MESSAGE.size : offset + length]))
 
 
 def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
@@ -207,11 +219,11 @@ def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
     end = 0
     while end + _RECORD.size <= len(view):
         kind, length = _RECORD.unpack_from(view, end)
-        at = end + _RECORD.size
-        if at + length > len(view) or (kind == MESSAGE and length < _MESSAGE.size):
+        offset = end + _RECORD.size
+        if offset + length > len(view) or (kind == MESSAGE and length < _MESSAGE.size):
             break
-        spans.append((kind, at, length))
-        end = at + length
+        spans.append((kind, offset, length))
+        end = offset + length
     return spans, end
 
 
@@ -221,7 +233,10 @@ def _attachment_name(content: bytes) -> str:
 
 
 def _decompress(compression: str, content: bytes, size: int) -> bytes:
-    """Return the unpacked content of a chunk, up to ``size + 1`` bytes, or the part that can be unpacked."""
+    """Return the unpacked content of a chunk, up to ``size + 1`` bytes, or the part that can be unpacked.
+
+    Raises `BrokenRecordError` for an unknown compression.
+    """
     if compression == "":
         return content
     if compression == "zstd":

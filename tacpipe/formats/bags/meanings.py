@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -55,7 +56,7 @@ def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
     """Return name, quantity, unit and component of a value by the enclosing message type and the value's path in it."""
     meanings: dict[tuple[str, Path], tuple[str, str, str, str]] = {}
 
-    def vector(kind: str, path: Path, name: str, quantity: str, unit: str, parts: Sequence[str] = _XYZ) -> None:
+    def add_vector(kind: str, path: Path, name: str, quantity: str, unit: str, parts: Sequence[str] = _XYZ) -> None:
         for part in parts:
             meanings[f"geometry_msgs/msg/{kind}", (*path, part)] = (
                 name.format(part),
@@ -64,21 +65,21 @@ def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
                 part,
             )
 
-    vector("Wrench", ("force",), "force_{}_n", "force", "N")
-    vector("Wrench", ("torque",), "torque_{}_nm", "torque", "N m")
+    add_vector("Wrench", ("force",), "force_{}_n", "force", "N")
+    add_vector("Wrench", ("torque",), "torque_{}_nm", "torque", "N m")
     for kind, path in (("Pose", ("position",)), ("Transform", ("translation",)), ("PointStamped", ("point",))):
-        vector(kind, path, "position_{}_m", "position", "m")
+        add_vector(kind, path, "position_{}_m", "position", "m")
     quaternion = ("x", "y", "z", "w")
     for kind, path in (
         ("Pose", ("orientation",)),
         ("Transform", ("rotation",)),
         ("QuaternionStamped", ("quaternion",)),
     ):
-        vector(kind, path, "orientation_{}", "orientation", "1", quaternion)
-    vector("Twist", ("linear",), "velocity_{}_m_s", "velocity", "m/s")
-    vector("Twist", ("angular",), "angular_velocity_{}_rad_s", "angular_velocity", "rad/s")
-    vector("Accel", ("linear",), "acceleration_{}_m_s2", "acceleration", "m/s^2")
-    vector("Accel", ("angular",), "angular_acceleration_{}_rad_s2", "angular_acceleration", "rad/s^2")
+        add_vector(kind, path, "orientation_{}", "orientation", "1", quaternion)
+    add_vector("Twist", ("linear",), "velocity_{}_m_s", "velocity", "m/s")
+    add_vector("Twist", ("angular",), "angular_velocity_{}_rad_s", "angular_velocity", "rad/s")
+    add_vector("Accel", ("linear",), "acceleration_{}_m_s2", "acceleration", "m/s^2")
+    add_vector("Accel", ("angular",), "angular_acceleration_{}_rad_s2", "angular_acceleration", "rad/s^2")
     for part in quaternion:
         meanings["sensor_msgs/msg/Imu", ("orientation", part)] = (
             f"orientation_{part}",
@@ -87,7 +88,7 @@ def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
             part,
         )
     for part in _XYZ:
-        imu, field_of = "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
+        imu, magnetic_field = "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
         name = f"angular_velocity_{part}_rad_s"
         meanings[imu, ("angular_velocity", part)] = (name, "angular_velocity", "rad/s", part)
         meanings[imu, ("linear_acceleration", part)] = (
@@ -96,7 +97,7 @@ def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
             "m/s^2",
             part,
         )
-        meanings[field_of, ("magnetic_field", part)] = (
+        meanings[magnetic_field, ("magnetic_field", part)] = (
             f"magnetic_field_{part}_t",
             "magnetic_field",
             "T",
@@ -129,15 +130,14 @@ def single_part(shape: MessageShape) -> list[MessagePart]:
 
 
 def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> MessagePart:
-    """Return a part with these leaves. Column names omit the first ``start`` names of each path."""
+    """Return a part with these leaves. Column names omit the first ``start`` names of each path.
+
+    A name that would occur several times is preceded by the path of its parent.
+    """
     result = MessagePart(suffix)
-    places = {
-        (name, leaf.path[:depth])
-        for leaf in leaves
-        if (meaning := enclosing_meaning(leaf))
-        for name, depth in [(meaning[0], meaning[4])]
-    }
-    repeated_names = {name for name, _ in places if sum(other_name == name for other_name, _ in places) > 1}
+    meanings = [(leaf, meaning) for leaf in leaves if (meaning := enclosing_meaning(leaf))]
+    parents = {(meaning[0], leaf.path[: meaning[4]]) for leaf, meaning in meanings}  # name, path of the parent
+    counts = Counter(name for name, _ in parents)
     for leaf in leaves:
         path = leaf.path[start:]
         if leaf.kind == "stamp" and path in _STAMPS:
@@ -148,7 +148,7 @@ def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -
             result.columns.append(PartColumn("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
         elif meaning := enclosing_meaning(leaf):
             name, quantity, unit, component, depth = meaning
-            before = _join_path(leaf.path[start:depth]) + "_" if name in repeated_names and depth > start else ""
+            before = _join_path(leaf.path[start:depth]) + "_" if counts[name] > 1 and depth > start else ""
             result.columns.append(PartColumn(before + name, leaf, about=_metadata(quantity, unit, component=component)))
         else:
             result.columns += columns_from_leaf(leaf, _join_path(path) or "data")
@@ -161,9 +161,8 @@ def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] 
         return [PartColumn(f"{name}_ns", leaf, about=about or (("unit", "ns"), ("quantity", "time")))]
     if leaf.count is None or leaf.kind == TEXT or is_bytes(leaf):
         return [PartColumn(name, leaf, about=about)]
-    if "covariance" in name:
-        about = about or (("quantity", "covariance"),)
-    return [PartColumn(f"{name}_{position}", leaf, position, about) for position in range(leaf.count)]
+    metadata = about or ((("quantity", "covariance"),) if "covariance" in name else ())
+    return [PartColumn(f"{name}_{position}", leaf, position, metadata) for position in range(leaf.count)]
 
 
 def is_bytes(leaf: Leaf) -> bool:
@@ -208,6 +207,10 @@ class _Joints:
         self._orders: dict[frozenset[str], list[str]] = {}
 
     def __call__(self, shape: MessageShape) -> list[MessagePart]:
+        """Return the part of a JointState: position, velocity and effort of each joint, in the order of the first message.
+
+        Messages with other joints have a stream of their own, named after their first joint.
+        """
         names = [shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "name"]
         order = self._orders.setdefault(frozenset(names), names)
         first = order is next(iter(self._orders.values()))
@@ -246,20 +249,20 @@ def _multi_array_parts(shape: MessageShape) -> list[MessagePart]:
         if leaf.path[0] != "layout":
             result.columns += columns_from_leaf(leaf, "_".join(map(str, leaf.path)))
     if dimensions and math.prod(sizes) == len(result.columns) and len(set(names)) == len(names):
-        places = itertools.product(*map(range, sizes))
+        positions = itertools.product(*map(range, sizes))
         result.columns = [
-            replace(column, about=tuple(zip(names, map(str, place), strict=True)))
-            for column, place in zip(result.columns, places, strict=True)
+            replace(column, about=tuple(zip(names, map(str, position), strict=True)))
+            for column, position in zip(result.columns, positions, strict=True)
         ]
     return [result]
 
 
 def _transform_parts(shape: MessageShape) -> list[MessagePart]:
     """Return the transforms of a message, one part per pair of frames."""
-    places = sorted({leaf.path[1] for leaf in shape.leaves}, key=int)
+    indices = sorted({leaf.path[1] for leaf in shape.leaves}, key=int)
     parts = []
-    for place in places:
-        leaves = [leaf for leaf in shape.leaves if leaf.path[1] == place]
+    for index in indices:
+        leaves = [leaf for leaf in shape.leaves if leaf.path[1] == index]
         child = next(shape.text(leaf) for leaf in leaves if leaf.path[-1] == "child_frame_id")
         parts.append(part_from_leaves([leaf for leaf in leaves if leaf.path[-1] != "child_frame_id"], 2, child))
     return parts
@@ -292,9 +295,9 @@ def _xela_parts(shape: MessageShape) -> list[MessagePart]:
     ``time`` is the server's Unix time in seconds; there is no header.
     """
     parts = []
-    for place in sorted({leaf.path[1] for leaf in shape.leaves}, key=int):
-        leaves = {leaf.path[2:]: leaf for leaf in shape.leaves if leaf.path[1] == place}
-        sensor_part = MessagePart(f"sensor{int(place) + 1}")
+    for index in sorted({leaf.path[1] for leaf in shape.leaves}, key=int):
+        leaves = {leaf.path[2:]: leaf for leaf in shape.leaves if leaf.path[1] == index}
+        sensor_part = MessagePart(f"sensor{int(index) + 1}")
         for path, leaf in leaves.items():
             if path[0] in ("taxels", "forces") and leaf.path[-1] in _XYZ:
                 taxel, axis = int(path[1]) + 1, str(path[-1])

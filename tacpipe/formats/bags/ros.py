@@ -31,7 +31,7 @@ def normalize_type_name(name: str) -> str:
 
 
 def parse_definitions(name: str, kind: Definition, text: str) -> Types:
-    """Return the fields of a message type and of its nested types, parsed from its definition.
+    """Return the fields of a message type and of its nested types by name, parsed from its definition.
 
     An empty definition is looked up in ROS 2's standard types. Raises `TopicError` if the text is not a definition.
     """
@@ -60,7 +60,10 @@ def parse_definitions(name: str, kind: Definition, text: str) -> Types:
 
 
 def _builtin_types(name: str) -> Types:
-    """Return the fields of a standard ROS 2 type; bags from before Humble contain no definitions."""
+    """Return the fields of a standard ROS 2 type; bags from before Humble contain no definitions.
+
+    Raises `TopicError` for another type.
+    """
     from rosbags.typesys import Stores, get_typestore
 
     definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
@@ -92,7 +95,7 @@ class RosDecoder:
                 chosen_messages = (
                     [messages[row] for row in chosen.tolist()] if len(chosen) < len(messages) else messages
                 )
-                self._expect_fitting(bytes(chosen_messages[0]), encoding)
+                self._replace_wrong_definition(bytes(chosen_messages[0]), encoding)
                 single: dict[Any, _SingleMessages] = {}
                 for shape, rows, matrix in wire.group_by_shape(
                     chosen_messages, self.types, self.name, encoding, known_shapes
@@ -100,7 +103,7 @@ class RosDecoder:
                     if len(rows) == 1:
                         # the shape may come from an earlier message
                         own_shape = replace(shape, first=matrix[0].tobytes())
-                        self._take(own_shape, int(chosen[rows[0]]), meaning, single)
+                        self._add_single(own_shape, int(chosen[rows[0]]), meaning, single)
                         continue
                     for same, message in _split_by_keys(shape, matrix, meaning):
                         yield from _decode_matrix(message, chosen[rows[same]], matrix[same], meaning)
@@ -110,20 +113,23 @@ class RosDecoder:
         except wire.WireError as error:
             raise TopicError(str(error)) from error
 
-    def _take(
+    def _add_single(
         self, shape: MessageShape, row: int, meaning: meanings.Meaning, single: dict[Any, _SingleMessages]
     ) -> None:
-        """Add a message with a unique shape to the messages that have the same leaves."""
+        """Add a message with a unique shape to the messages in ``single`` that have the same leaves and keys."""
         keys = tuple(
             shape.first[leaf.offset : leaf.offset + leaf.size] for leaf in shape.leaves if meaning.is_key(leaf)
         )
-        same = (tuple(shape.counts), keys)
-        if same not in single:
-            single[same] = _SingleMessages.from_shape(shape, meaning)
-        single[same].add(shape, row)
+        group = (tuple(shape.counts), keys)
+        if group not in single:
+            single[group] = _SingleMessages.from_shape(shape, meaning)
+        single[group].add(shape, row)
 
-    def _expect_fitting(self, message: bytes, encoding: Encoding) -> None:
-        """Use ROS's own definition if the file's does not match; old recorders wrote the definition of another type."""
+    def _replace_wrong_definition(self, message: bytes, encoding: Encoding) -> None:
+        """Use ROS's own definition of the type if the file's does not match ``message``.
+
+        Old recorders wrote the definition of another type.
+        """
         try:
             wire.walk_message(message, self.types, self.name, encoding)
         except wire.WireError:
@@ -178,6 +184,7 @@ def _header_columns(part: meanings.MessagePart) -> list[PartColumn]:
 
 
 def _column_type(column: PartColumn) -> pa.DataType:
+    """Return the type of a column: text, stamps in ns, bytes, or numbers."""
     leaf = column.leaf
     if leaf.kind in (TEXT, "stamp"):
         return pa.string() if leaf.kind == TEXT else pa.int64()
@@ -195,16 +202,16 @@ def _free_name(name: str, columns: Collection[str]) -> str:
 def _split_by_keys(
     shape: MessageShape, matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[tuple[np.ndarray[Any, np.dtype[np.int64]], MessageShape]]:
-    """Yield the rows (row,) with equal keys, and a shape whose first message has these keys."""
+    """Yield the indices (row,) of messages with equal keys, and a shape whose first message has these keys."""
     keys = [leaf for leaf in shape.leaves if meaning.is_key(leaf)]
     remaining = np.arange(len(matrix))
     if not keys:
         yield remaining, shape
         return
-    places = np.concatenate([np.arange(leaf.offset, leaf.offset + leaf.size) for leaf in keys])
+    key_bytes = np.concatenate([np.arange(leaf.offset, leaf.offset + leaf.size) for leaf in keys])
     while len(remaining):
         first = matrix[remaining[0]]
-        same = (matrix[remaining][:, places] == first[places]).all(axis=1)
+        same = (matrix[remaining][:, key_bytes] == first[key_bytes]).all(axis=1)
         yield remaining[same], replace(shape, first=first.tobytes())
         remaining = remaining[~same]
 
@@ -212,6 +219,7 @@ def _split_by_keys(
 def _decode_matrix(
     shape: MessageShape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[Block]:
+    """Yield the block of each part of messages (message, byte) of one shape; ``rows`` are their positions in the batch."""
     cache: dict[int, Any] = {}  # values by leaf offset: an array is viewed once for all of its columns
     for part in meaning.parts(shape):
         columns: dict[str, pa.Array] = {}
@@ -229,6 +237,7 @@ def _decode_matrix(
 
 
 def _column_array(shape: MessageShape, column: PartColumn, matrix: Matrix, cache: dict[int, Any]) -> pa.Array:
+    """Return a column of messages (message, byte). ``cache`` keeps the values of arrays by the offset of their leaf."""
     leaf = column.leaf
     if leaf.kind == TEXT:
         return _text_array(leaf, matrix)
@@ -242,6 +251,7 @@ def _column_array(shape: MessageShape, column: PartColumn, matrix: Matrix, cache
 
 
 def _bytes_array(leaf: Leaf, matrix: Matrix) -> pa.Array:
+    """Return an array of bytes, one per message. Raises `TopicError` if they exceed the limit of 2 GiB."""
     count = leaf.count or 0
     content = np.ascontiguousarray(matrix[:, leaf.offset : leaf.offset + count])
     offsets = np.arange(len(matrix) + 1, dtype=np.int64) * count
@@ -253,6 +263,7 @@ def _bytes_array(leaf: Leaf, matrix: Matrix) -> pa.Array:
 
 
 def _text_array(leaf: Leaf, matrix: Matrix) -> pa.Array:
+    """Return a text of each message, with replacement characters for invalid UTF-8."""
     content = _bytes_array(leaf, matrix)
     try:
         return content.cast(pa.string())

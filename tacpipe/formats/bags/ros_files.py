@@ -133,7 +133,7 @@ def read_sqlite_records(path: Path) -> Iterator[Record]:
 
 @contextlib.contextmanager
 def _connect(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database read-only. If it has a write-ahead log (-wal), open a copy of both."""
+    """Open a database read-only in the block. If it has a write-ahead log (-wal), open a copy of both."""
     log = regular.inside(path.parent, f"{path.name}-wal")
     with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
         if copies is None:
@@ -151,7 +151,10 @@ def _connect(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
-    """Raise `TacpipeError` if topics or messages are not tables: views and modules would run queries stored in the file."""
+    """Raise `TacpipeError` if topics or messages are not tables.
+
+    Views and virtual tables would run queries that are stored in the file.
+    """
     definitions = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name in ("topics", "messages"):
         if not str(definitions.get(name, "")).upper().startswith("CREATE TABLE"):
@@ -161,6 +164,7 @@ def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
 
 
 def _read_channels(connection: sqlite3.Connection) -> Iterator[Record]:
+    """Yield the channels in a database with the definitions of their types, and the ROS distribution."""
     definitions: dict[str, tuple[str, bytes]] = {}
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "message_definitions" in tables:
@@ -197,7 +201,10 @@ def read_bag_records(path: Path) -> Iterator[Record]:
 
 
 def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool = False) -> Iterator[Record]:
-    """Yield the records of a file or of a chunk."""
+    """Yield the records of a file or of a chunk, whose ``size`` is in bytes.
+
+    Raises `BrokenRecordError` if the file is truncated, damaged or encrypted.
+    """
     lost: LostChunk | None = None
     while file.tell() < size:
         header = _header_fields(_read_sized(file, size, MAX_HEADER_BYTES))
@@ -217,8 +224,8 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
             raise BrokenRecordError("a chunk lies within a chunk")
         if kind == CHUNK:
             content, complete = _read_content(file, size)
-            inside, problem = _decompress(header.get("compression", b"none"), content, _field_number(header, "size"))
-            read_records = _read_records(path, io.BytesIO(inside), len(inside), within_chunk=True)
+            unpacked, problem = _decompress(header.get("compression", b"none"), content, _field_number(header, "size"))
+            read_records = _read_records(path, io.BytesIO(unpacked), len(unpacked), within_chunk=True)
             if not complete:
                 yield from read_records
                 raise BrokenRecordError(CUT_OFF)
@@ -227,7 +234,7 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
                     [] if problem else list(read_records)
                 )  # if a chunk is damaged, none of its records can be trusted
             except BrokenRecordError:
-                problem = f"of {len(inside):,} bytes is damaged"
+                problem = f"of {len(unpacked):,} bytes is damaged"
             lost = LostChunk(problem) if problem else None
             continue
         content = _read_sized(file, size)
@@ -242,8 +249,8 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
 
 
 def _count_lost_messages(lost: LostChunk, index: bytes) -> None:
-    """Count the lost messages that a chunk index lists for one connection: 8 bytes of time and 4 of offset each."""
-    times = [_time_ns(index[at : at + 8]) for at in range(0, len(index) - 11, 12)]
+    """Add the messages that an index lists to those of a lost chunk; an entry has 8 bytes of time and 4 of offset."""
+    times = [_time_ns(index[offset : offset + 8]) for offset in range(0, len(index) - 11, 12)]
     lost.count += len(times)
     if times:
         lost.first_ns = min(*times, lost.first_ns or times[0], times[0])
@@ -268,21 +275,24 @@ def _field_number(header: dict[str, bytes], name: str) -> int:
 
 
 def _header_fields(content: bytes) -> dict[str, bytes]:
-    """Return the fields of a record header. Each field is its length, its name, "=" and its value."""
+    """Return the fields of a record header by name. Each field is its length, its name, "=" and its value.
+
+    Raises `BrokenRecordError` if the header is damaged.
+    """
     fields: dict[str, bytes] = {}
-    at = 0
-    while at + 4 <= len(content):
-        length = int.from_bytes(content[at : at + 4], "little")
-        name, sign, value = content[at + 4 : at + 4 + length].partition(b"=")
-        if not sign or at + 4 + length > len(content):
+    offset = 0
+    while offset + 4 <= len(content):
+        length = int.from_bytes(content[offset : offset + 4], "little")
+        name, sign, value = content[offset + 4 : offset + 4 + length].partition(b"=")
+        if not sign or offset + 4 + length > len(content):
             raise BrokenRecordError("the header of a record is damaged")
         fields[name.decode(errors="replace")] = value
-        at += 4 + length
+        offset += 4 + length
     return fields
 
 
 def _read_sized(file: BinaryIO, size: int, max_bytes: int | None = None) -> bytes:
-    """Return the bytes after a length word."""
+    """Return the bytes after a length word. Raises `BrokenRecordError` if there are fewer, or more than ``max_bytes``."""
     length = _read_length(file)
     if max_bytes is not None and length > max_bytes:
         raise BrokenRecordError(f"a record has a header of {length} bytes; the file is damaged from there on")
@@ -292,7 +302,10 @@ def _read_sized(file: BinaryIO, size: int, max_bytes: int | None = None) -> byte
 
 
 def _read_content(file: BinaryIO, size: int) -> tuple[bytes, bool]:
-    """Return the bytes after a length word that the file contains, and whether they are complete."""
+    """Return the bytes after a length word that the file contains, and whether they are complete.
+
+    Raises `BrokenRecordError` if they exceed the memory limit.
+    """
     length = _read_length(file)
     available = min(length, size - file.tell())
     if available > memory.MAX_BLOCK_BYTES:
@@ -318,20 +331,23 @@ def _read_length(file: BinaryIO) -> int:
 
 
 def _decompress(compression: bytes, content: bytes, size: int) -> tuple[bytes, str]:
-    """Return the intact part of a chunk's unpacked content, and a problem that completes "a chunk …"."""
+    """Return the intact part of a chunk's unpacked content, and a problem that completes "a chunk …", or "".
+
+    Raises `BrokenRecordError` for an unknown compression.
+    """
     if size > memory.MAX_BLOCK_BYTES:
         return b"", f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
-    inside = content
+    unpacked = content
     try:
         if compression == b"bz2":
-            inside = bz2.BZ2Decompressor().decompress(content, size + 1)
+            unpacked = bz2.BZ2Decompressor().decompress(content, size + 1)
         elif compression == b"lz4":
             import lz4.frame
 
-            inside = bytes(lz4.frame.LZ4FrameDecompressor().decompress(content, size + 1))
+            unpacked = bytes(lz4.frame.LZ4FrameDecompressor().decompress(content, size + 1))
         elif compression != b"none":
             name = plain(compression.decode(errors="replace"))
             raise BrokenRecordError(f"its chunks are compressed with {name}, not bz2 or lz4")
     except (OSError, RuntimeError, EOFError):
-        inside = b""
-    return inside, "" if len(inside) == size else f"of {size:,} bytes is damaged"
+        unpacked = b""
+    return unpacked, "" if len(unpacked) == size else f"of {size:,} bytes is damaged"

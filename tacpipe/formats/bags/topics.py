@@ -43,6 +43,7 @@ class TopicRows:
     """Collects the rows of one stream in ``spill``, and the properties shared by all rows."""
 
     def __init__(self, spill: Spill) -> None:
+        """Create an empty stream whose rows are stored in ``spill``."""
         self._spill = spill
         self._pieces: list[Piece] = []
         self._schema: pa.Schema = pa.schema([])
@@ -83,8 +84,11 @@ class TopicRows:
         self._pieces.append(self._spill.add(table, orders))
 
     def finish(self, suffix: str) -> TopicStream:
-        """Return the rows ordered by their clock, and the name of its column."""
-        clock, note = self._clock()
+        """Return the rows ordered by their clock, as the stream with this suffix.
+
+        Columns of constant or redundant times and frames are left out.
+        """
+        clock, note = self._choose_clock()
         left_out = set() if self._published_apart else {PUBLISH}
         if clock == LOG and HEADER not in self._absent and not self._headers_set:
             left_out.add(HEADER)
@@ -109,8 +113,8 @@ class TopicRows:
         content = Batched(schema, count, lambda: spill.in_order(self._pieces, read, clock))
         return TopicStream(suffix, content, Time(clock, "ns"), note)
 
-    def _clock(self) -> tuple[str, str]:
-        """Return the time column, and the reason if it is not the header stamp.
+    def _choose_clock(self) -> tuple[str, str]:
+        """Return the name of the time column, and the reason if header stamps exist and are not used, or "".
 
         A header stamp is the time of measurement; the log time is the time of arrival. Header stamps are used only if
         all are set and they share the log's clock. Stamps of a simulation, of a device clock, or of a clock that was
@@ -202,6 +206,10 @@ class TopicDecoder:
         return [rows.finish(suffix) for suffix, rows in self._streams.items()]
 
     def _flush(self) -> None:
+        """Decode the messages in memory and add their rows to the streams.
+
+        Raises `TopicError` for too many values per message, and for values of different types in one column.
+        """
         if not self._messages:
             return
         log_ns, publish_ns = (_stamp_array(values) for values in (self._log_ns, self._publish_ns))
@@ -264,12 +272,13 @@ def block_from_rows(rows: Sequence[Mapping[str, Leaf]], types: Mapping[str, pa.D
 
 
 def _column_array(values: Sequence[Any], kind: pa.DataType | None) -> pa.Array:
+    """Return values as a column of this type, or else as floats or texts; empty texts if all are None."""
     try:
         column = pa.array(values, kind)
     except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):
-        numbers = all(isinstance(value, int | float | None) for value in values)
-        floats = [None if value is None else float(value) for value in values] if numbers else None
-        column = pa.array(floats) if floats else pa.array([None if value is None else str(value) for value in values])
+        are_numbers = all(isinstance(value, int | float | None) for value in values)
+        convert = float if are_numbers else str
+        column = pa.array([None if value is None else convert(value) for value in values])
     return pa.array([""] * len(values), pa.string()) if pa.types.is_null(column.type) else column
 
 
@@ -285,7 +294,7 @@ class Json:
         rows: list[dict[str, Leaf]] = []
         for message in messages:
             try:
-                value = json.loads(message, object_pairs_hook=_refuse_repeated)
+                value = json.loads(message, object_pairs_hook=_build_object)
             except TopicError:
                 raise
             except (ValueError, RecursionError) as error:
@@ -301,6 +310,7 @@ class Json:
         yield block_from_rows(rows, dict.fromkeys(encoded, pa.binary()))
 
     def _base64_properties(self) -> set[str]:
+        """Return the names of the properties that the schema declares as base64; an empty set without a valid schema."""
         try:
             schema = json.loads(self.schema or "{}")
             return {
@@ -312,25 +322,25 @@ class Json:
             return set()
 
 
-def _refuse_repeated(pairs: Sequence[tuple[str, Any]]) -> Values:
-    """Return a JSON object. Raises `TopicError` if it repeats a name."""
+def _build_object(pairs: Sequence[tuple[str, Any]]) -> Values:
+    """Return a JSON object from its entries. Raises `TopicError` if it repeats a name."""
     value = dict(pairs)
     if len(value) < len(pairs):
         raise TopicError("a message has two entries of the same name")
     return value
 
 
-def flatten_object(nested: Values, before: str = "") -> dict[str, Leaf]:
+def flatten_object(nested: Values, prefix: str = "") -> dict[str, Leaf]:
     """Return nested objects and lists as values by path; a time (``sec`` and ``nsec``) becomes one value in nanoseconds.
 
     >>> flatten_object({"stamp": {"sec": 1, "nsec": 5}, "a": {"x": 1.5}, "l": [1, 2], "n": None})
     {'stamp': 1000000005, 'a.x': 1.5, 'l.0': 1, 'l.1': 2, 'n': None}
     """
     values: dict[str, Leaf] = {}
-    for name, value in nested.items():
-        path = f"{before}{name}"
-        if isinstance(value, list):
-            value = {str(position): element for position, element in enumerate(value)}
+    for name, entry in nested.items():
+        path = f"{prefix}{name}"
+        is_list = isinstance(entry, list)
+        value = {str(position): element for position, element in enumerate(entry)} if is_list else entry
         if not isinstance(value, dict):
             values[path] = value
         elif set(value) in ({"sec", "nsec"}, {"sec", "nanosec"}) and all(
@@ -372,13 +382,14 @@ class Protobuf:
         rows = []
         for message in messages:
             try:
-                rows.append(flatten_message(self._class.FromString(message), types))
+                rows.append(flatten_message(self._message_class.FromString(message), types))
             except (DecodeError, RecursionError) as error:
                 raise TopicError(f"a message is not a {plain(self.name)}") from error
         yield block_from_rows(rows, types)
 
     @functools.cached_property
-    def _class(self) -> Any:
+    def _message_class(self) -> Any:
+        """The class of the messages. Raises `TopicError` if the file does not define their type."""
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
         from google.protobuf.message import DecodeError
 
@@ -392,12 +403,15 @@ class Protobuf:
             raise TopicError(f"the file has no definition of its type {plain(self.name)}") from error
 
 
-def flatten_message(message: Any, types: dict[str, pa.DataType], before: str = "") -> dict[str, Leaf]:
-    """Return a message as values by path, all fields without presence too; the types of numbers are added to ``types``."""
+def flatten_message(message: Any, types: dict[str, pa.DataType], prefix: str = "") -> dict[str, Leaf]:
+    """Return a message as values by path, and add the types of numbers to ``types``.
+
+    Fields without presence are always included, others only if they are set.
+    """
     values: dict[str, Leaf] = {}
     for descriptor in message.DESCRIPTOR.fields:
         value = getattr(message, descriptor.name)
-        path = f"{before}{descriptor.name}"
+        path = f"{prefix}{descriptor.name}"
         if descriptor.message_type is not None and descriptor.message_type.GetOptions().map_entry:
             values_by_path = {f"{path}.{key}": value[key] for key in sorted(value, key=str)}
             descriptor = descriptor.message_type.fields_by_name["value"]

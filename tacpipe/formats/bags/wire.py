@@ -139,17 +139,16 @@ def group_by_shape(
     Adds new shapes to ``earlier_shapes``. Raises `WireError` if a message does not match its type.
     """
     sizes = np.fromiter(map(len, messages), np.int64, len(messages))
-    different, first = np.unique(sizes, return_index=True)
-    for size in different[np.argsort(first)]:
+    sizes_present, first_rows = np.unique(sizes, return_index=True)
+    for size in sizes_present[np.argsort(first_rows)]:
         rows = np.flatnonzero(sizes == size)
         content = messages[int(rows[0])] if len(rows) == 1 else b"".join([messages[row] for row in rows.tolist()])
         matrix = np.frombuffer(content, np.uint8).reshape(len(rows), int(size))
         candidates = [shape for shape in earlier_shapes if shape.size == size]
         tried = matched = 0
         while len(rows):
-            if (
-                tried >= TRIED_SHAPES and matched < FEW_MESSAGES * tried
-            ):  # text lengths vary so much that few messages share a shape
+            # text lengths vary so much that few messages share a shape
+            if tried >= TRIED_SHAPES and matched < FEW_MESSAGES * tried:
                 for row, message in zip(rows.tolist(), matrix, strict=True):
                     yield walk_message(message.tobytes(), types, name, encoding), np.array([row]), message[None]
                 break
@@ -169,6 +168,7 @@ def group_by_shape(
 
 
 def _matching_rows(shape: MessageShape, matrix: Matrix) -> npt.NDArray[np.bool_]:
+    """Return a mask (message,) of the messages (message, byte) whose lengths of texts and sequences are those of a shape."""
     first = np.frombuffer(shape.first, np.uint8)
     same = np.ones(len(matrix), bool)
     for offset in shape.lengths:
@@ -180,7 +180,7 @@ def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) ->
     """Return the shape of a message. Raises `WireError` if its bytes do not match its type."""
     shape = MessageShape(encoding, len(message), first=message)
     try:
-        end = _Walk(message, types, shape).message(name, (), (), encoding.start)
+        end = _Walk(message, types, shape).walk(name, (), (), encoding.start)
     except (struct.error, KeyError, RecursionError) as error:
         problem = (
             f"the type {plain(str(error.args[0]))} is not defined" if isinstance(error, KeyError) else "it ends early"
@@ -198,77 +198,88 @@ class _Walk:
     shape: MessageShape
     messages: int = 0  # messages walked, including those without fields
 
-    def message(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
-        """Walk the fields of a message that starts at ``at`` and return its end."""
+    def walk(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+        """Walk the fields of a message that starts at ``at`` and return its end.
+
+        Raises `WireError` for too many messages in it, and `struct.error` or `KeyError` if the bytes do not match.
+        """
         if name in STAMPS:
-            at = self._align(at, 4)
-            self._add(Leaf(path, "stamp", at, None, enclosing))
-            return at + 8
+            start = self._align(at, 4)
+            self._add(Leaf(path, "stamp", start, None, enclosing))
+            return start + 8
         self.messages += 1
         if self.messages > MAX_LEAVES:
             raise WireError(f"a message has more than {MAX_LEAVES} messages in it")
-        enclosing = (*enclosing, (len(path), name))
+        outer = (*enclosing, (len(path), name))
         fields = [field for field in self.types[name] if field[0] != "structure_needs_at_least_one_member"]
         if not fields:
             return self._skip_empty_byte(at)
+        end = at
         for field_name, description in fields:
-            at = self._field(description, (*path, field_name), enclosing, at)
-        return at
+            end = self._walk_field(description, (*path, field_name), outer, end)
+        return end
 
     def _skip_empty_byte(self, at: int) -> int:
-        """Skip the byte that CDR writes for a message without fields, also if its definition has only constants."""
+        """Return the offset after the byte that CDR writes for a message without fields, or with only constants.
+
+        Raises `struct.error` if the message ends before.
+        """
         end = at + self.shape.encoding.aligned  # ROS 1 writes nothing
         if end > len(self.content):
             raise struct.error
         return end
 
-    def _field(self, description: Any, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+    def _walk_field(self, description: Any, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+        """Add the leaves of a field at offset ``at``, and return its end. Raises the errors of `walk`."""
         node, inner = int(description[0]), description[1]
         if node == _NAME:
-            return self.message(inner, path, enclosing, at)
+            return self.walk(inner, path, enclosing, at)
         if node == _BASE:
-            return self._single(inner[0], path, enclosing, at)
+            return self._walk_single(inner[0], path, enclosing, at)
         element: Any = inner[0]
         count: int = inner[1]
+        end = at
         if node != _ARRAY:
-            count, at = self._length(at)
+            count, end = self._read_length(at)
             self.shape.counts.append(count)
         kind = element[1][0] if int(element[0]) == _BASE else ""
         if kind in NUMBERS:
             width = np.dtype(NUMBERS[kind]).itemsize
-            at = self._align(at, width) if count else at
-            if at + width * count > len(self.content):
+            start = self._align(end, width) if count else end
+            if start + width * count > len(self.content):
                 raise struct.error
-            self._add(Leaf(path, kind, at, count, enclosing))
-            return at + width * count
+            self._add(Leaf(path, kind, start, count, enclosing))
+            return start + width * count
         if count > max(len(self.content), MAX_LEAVES):  # elements without fields take no bytes in ROS 1
             raise struct.error
         for position in range(count):
-            at = self._field(element, (*path, position), enclosing, at)
-        return at
+            end = self._walk_field(element, (*path, position), enclosing, end)
+        return end
 
-    def _single(self, kind: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+    def _walk_single(self, kind: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+        """Add a text or a number at offset ``at``, and return its end. Raises the errors of `walk`."""
         if kind == "string":
-            length, at = self._length(at)
-            if at + length > len(self.content):
+            length, start = self._read_length(at)
+            if start + length > len(self.content):
                 raise struct.error
-            self._add(Leaf(path, TEXT, at, max(length - self.shape.encoding.terminated, 0), enclosing))
-            return at + length
+            self._add(Leaf(path, TEXT, start, max(length - self.shape.encoding.terminated, 0), enclosing))
+            return start + length
         if kind not in NUMBERS:
             raise WireError(f"its field {'.'.join(map(str, path))} is a {plain(kind)}, which is not read")
         width = np.dtype(NUMBERS[kind]).itemsize
-        at = self._align(at, width)
-        if at + width > len(self.content):
+        start = self._align(at, width)
+        if start + width > len(self.content):
             raise struct.error
-        self._add(Leaf(path, kind, at, None, enclosing))
-        return at + width
+        self._add(Leaf(path, kind, start, None, enclosing))
+        return start + width
 
-    def _length(self, at: int) -> tuple[int, int]:
-        at = self._align(at, 4)
+    def _read_length(self, at: int) -> tuple[int, int]:
+        """Return the length word at offset ``at``, and the offset after it."""
+        start = self._align(at, 4)
         length: int
-        (length,) = struct.unpack_from(f"{self.shape.encoding.order}I", self.content, at)
-        self.shape.lengths.append(at)
-        return length, at + 4
+        (length,) = struct.unpack_from(f"{self.shape.encoding.order}I", self.content, start)
+        self.shape.lengths.append(start)
+        return length, start + 4
 
     def _align(self, at: int, width: int) -> int:
         start = self.shape.encoding.start

@@ -76,13 +76,18 @@ class LeRobotContainer:
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
         """Return the file, the native streams and the metadata that an episode is read from."""
         entry = self._find_episode(episode)
-        about = self._about
-        native = self._native(entry)
-        paths = [regular.inside(self.path, entry.file), *native.values()]
-        paths += [] if native else [regular.inside(self.path, video) for video in entry.videos.values()]
+        dataset = self._about
+        native_streams = self._native(entry)
+        paths = [regular.inside(self.path, entry.file), *native_streams.values()]
+        paths += [] if native_streams else [regular.inside(self.path, video) for video in entry.videos.values()]
         with regular.failing(self.path):
             files = {path.relative_to(self.path).as_posix(): path for path in paths if file_system.present(path)}
-        values = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": entry.index}
+        values = {
+            "fps": dataset.fps,
+            "robot": dataset.robot,
+            "features": dataset.info["features"],
+            "index": entry.index,
+        }
         values |= {"tasks": list(entry.tasks), "videos": dict(entry.videos), "attributes": dict(entry.attributes)}
         values |= {"length": entry.length}
         return Share(files or {description.INFO: self.path / description.INFO}, values)
@@ -119,10 +124,13 @@ class LeRobotContainer:
         return {"": file} if file.is_file() and not paths else paths
 
     def _contents(self, episode: EpisodeDescription, sources: Collection[str] | None, *, rows: bool) -> EpisodeContents:
-        native = self._native(episode)
-        if native:
+        """Return the streams, attributes and missing videos of an episode; without ``rows``, only the first ones."""
+        native_streams = self._native(episode)
+        if native_streams:
             streams = [
-                self._exported_stream(name, path) for name, path in native.items() if _is_selected(name, sources)
+                self._exported_stream(name, path)
+                for name, path in native_streams.items()
+                if _is_selected(name, sources)
             ]
             return EpisodeContents(streams, episode.original or {}, notes=self._notes(episode))
         attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
@@ -142,12 +150,12 @@ class LeRobotContainer:
 
     def _exported_stream(self, name: str, path: Path) -> SourceStream:
         """Return a stream bit for bit as before the export. Rows of a long stream are decoded when they are read."""
-        with _copied_again(path):
+        with _advise_copy(path):
             stored = ParquetTable(regular.source(path))
             content = stored.read() if stored.num_rows <= SOME_ROWS else None
 
         def read() -> Iterator[pa.Table]:
-            with _copied_again(path):
+            with _advise_copy(path):
                 yield from stored.batches()
 
         rows = Batched(stored.schema, stored.num_rows, read) if content is None else content
@@ -156,21 +164,27 @@ class LeRobotContainer:
     def _streams(
         self, episode: EpisodeDescription, sources: Collection[str] | None, *, rows: bool
     ) -> list[SourceStream]:
+        """Return the streams of an episode: one per feature or group of features, and one per video.
+
+        Without ``rows``, their tables are empty.
+        """
         by_source: dict[str, list[FeatureDescription]] = {}
         for feature in self._about.features.values():
             if feature.key not in (*COUNTING_FEATURES, EXACT) and feature.dtype != "video":
-                first = feature.key.partition(".")[0]
-                by_source.setdefault(first if first in SHARED_STREAMS else feature.key, []).append(feature)
+                prefix = feature.key.partition(".")[0]
+                by_source.setdefault(prefix if prefix in SHARED_STREAMS else feature.key, []).append(feature)
         videos = [
             key
             for key, video in episode.videos.items()
             if _is_selected(key, sources) and file_system.present(regular.inside(self.path, video))
         ]
         names = container.identifiers([_stream_stem(source) for source in [*by_source, *episode.videos]])
-        chosen = {source: features for source, features in by_source.items() if _is_selected(source, sources)}
-        exact = [EXACT] if EXACT in self._about.features else []
-        frames = self._frames(episode, [*exact, *(feature.key for features in chosen.values() for feature in features)])
-        if exact:
+        selected = {source: features for source, features in by_source.items() if _is_selected(source, sources)}
+        exact_keys = [EXACT] if EXACT in self._about.features else []
+        frames = self._frames(
+            episode, [*exact_keys, *(feature.key for features in selected.values() for feature in features)]
+        )
+        if exact_keys:
             t_ns, time_metadata = frames.column(EXACT).to_numpy(), {}
         else:
             t_ns, stamp_source = _frame_stamps(frames, self._about.fps, self.path / episode.file)
@@ -178,13 +192,13 @@ class LeRobotContainer:
         clock = pa.field(CLOCK.column, pa.int64(), metadata=time_metadata)
         frames = frames if rows else frames.slice(0, 0)
         streams = [self._video_stream(episode, key, names[_stream_stem(key)], t_ns, clock) for key in videos]
-        streams = [replace(stream, time=replace(CLOCK, origin="unix")) if exact else stream for stream in streams]
-        for source, features in chosen.items():
+        streams = [replace(stream, time=replace(CLOCK, origin="unix")) if exact_keys else stream for stream in streams]
+        for source, features in selected.items():
             columns = [(clock, pa.array(t_ns[: frames.num_rows]))]
             for feature in features:
                 columns += self._columns(episode, feature, frames.column(feature.key))
             table = pa.table([values for _, values in columns], pa.schema([field for field, _ in columns]))
-            time = replace(CLOCK, origin="unix") if exact else CLOCK
+            time = replace(CLOCK, origin="unix") if exact_keys else CLOCK
             streams.append(SourceStream(source, names[_stream_stem(source)], time, table, episode.length))
         return streams
 
@@ -252,26 +266,39 @@ class LeRobotContainer:
     def _columns(
         self, episode: EpisodeDescription, feature: FeatureDescription, values: pa.ChunkedArray
     ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
+        """Return field and values of each column of a feature."""
         if feature.dtype == "image":
             return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _picture_bytes(values))]
-        last = feature.key.rpartition(".")[2]
-        about = meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
-        names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
+        short_name = feature.key.rpartition(".")[2]
+        column_meanings = meanings(short_name, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
+        names = feature.names or (
+            [short_name] if feature.width == 1 else [f"{short_name}_{position}" for position in range(feature.width)]
+        )
         columns: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
-        for at, column in enumerate(self._flat(episode, feature, values)):
-            meaning = about[at] if about[at] != NO_MEANING else meaning_from_name(names[at], feature.dtype)
+        for position, column in enumerate(self._flat(episode, feature, values)):
+            meaning = (
+                column_meanings[position]
+                if column_meanings[position] != NO_MEANING
+                else meaning_from_name(names[position], feature.dtype)
+            )
             metadata = {"quantity": meaning.quantity, "unit": meaning.unit, "component": meaning.component}
             if feature.quantities:
-                metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}
+                metadata = {
+                    "quantity": feature.quantities[position],
+                    "unit": feature.units[position] if feature.units else "",
+                }
             columns.append(
-                (pa.field(names[at], column.type, metadata={k: v for k, v in metadata.items() if v}), column)
+                (pa.field(names[position], column.type, metadata={k: v for k, v in metadata.items() if v}), column)
             )
         return columns
 
     def _flat(
         self, episode: EpisodeDescription, feature: FeatureDescription, values: pa.ChunkedArray
     ) -> Sequence[pa.Array | pa.ChunkedArray]:
-        """Return the columns of a feature; nested lists are flattened."""
+        """Return the columns of a feature; nested lists are flattened.
+
+        Raises `TacpipeError` if a row does not have as many values as the feature declares.
+        """
         kind = values.type
         inner = values.combine_chunks()
         while (
@@ -288,9 +315,12 @@ class LeRobotContainer:
                 f"values that {description.INFO} states."
             )
         if pa.types.is_string(inner.type):
-            return [inner.take(pa.array(np.arange(at, len(inner), feature.width))) for at in range(feature.width)]
+            return [
+                inner.take(pa.array(np.arange(position, len(inner), feature.width)))
+                for position in range(feature.width)
+            ]
         flat = inner.to_numpy(zero_copy_only=False).reshape(len(values), feature.width)
-        return [pa.array(np.ascontiguousarray(flat[:, at])) for at in range(feature.width)]
+        return [pa.array(np.ascontiguousarray(flat[:, position])) for position in range(feature.width)]
 
 
 def open_lerobot(path: Path) -> LeRobotContainer:
@@ -299,8 +329,8 @@ def open_lerobot(path: Path) -> LeRobotContainer:
 
 
 @contextlib.contextmanager
-def _copied_again(path: Path) -> Iterator[None]:
-    """Add to errors about damaged files what to do."""
+def _advise_copy(path: Path) -> Iterator[None]:
+    """Add the advice to copy the file again to errors in the block."""
     try:
         yield
     except TacpipeError as error:
@@ -323,17 +353,22 @@ def _stream_stem(source: str) -> str:
 def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
     """Return the row groups that may contain an episode, according to the statistics of its index."""
     metadata = file.metadata
-    column = [metadata.schema.column(statistics).path for statistics in range(metadata.num_columns)].index(INDEX)
-    about = [metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)]
+    column = [metadata.schema.column(number).path for number in range(metadata.num_columns)].index(INDEX)
+    statistics_by_group = [
+        metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)
+    ]
     return [
         group
-        for group, statistics in enumerate(about)
+        for group, statistics in enumerate(statistics_by_group)
         if statistics is None or not statistics.has_min_max or statistics.min <= episode <= statistics.max
     ]
 
 
 def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
-    """Return timestamps (time,) in ns since the start of the episode, and their source."""
+    """Return timestamps (time,) in ns since the start of the episode, and how they were made.
+
+    They are computed from the rate if the stored times agree with it. Raises `TacpipeError` if a time is not finite.
+    """
     index = frames.column(FRAME).to_numpy().astype(np.int64)  # (time,)
     seconds = frames.column(STAMP).to_numpy().astype(np.float64)
     if not np.isfinite(seconds).all():
@@ -351,8 +386,10 @@ def _exact_stamps(index: Int64s, fps: float) -> Int64s:
     >>> _exact_stamps(np.array([1, 2, 3]), 30.0).tolist()
     [33333333, 66666667, 100000000]
     """
-    above, below = fps.as_integer_ratio()
-    return np.array([(2 * int(frame) * 10**9 * below + above) // (2 * above) for frame in index], np.int64)
+    numerator, denominator = fps.as_integer_ratio()
+    return np.array(
+        [(2 * int(frame) * 10**9 * denominator + numerator) // (2 * numerator) for frame in index], np.int64
+    )
 
 
 def _picture_bytes(values: pa.ChunkedArray) -> pa.ChunkedArray:

@@ -103,6 +103,10 @@ class LeRobotDescription:
         return sorted(episodes, key=lambda episode: episode.index)
 
     def _episodes_from_lines(self) -> Iterator[EpisodeDescription]:
+        """Yield the episodes of a dataset of version 2, from ``meta/episodes.jsonl``.
+
+        Raises `TacpipeError` if it is invalid.
+        """
         path = self.root / "meta/episodes.jsonl"
         size = self.info.get("chunks_size") or 1000
         if not isinstance(size, int) or size < 1:
@@ -128,8 +132,14 @@ class LeRobotDescription:
             )
 
     def _episodes_from_parquet(self) -> Iterator[EpisodeDescription]:
+        """Yield the episodes of a dataset of version 3, from ``meta/episodes``.
+
+        Raises `TacpipeError` if there are none.
+        """
         folders = file_system.walk(self.root / "meta/episodes")
-        paths = sorted(Path(place, name) for place, _, names in folders for name in names if name.endswith(".parquet"))
+        paths = sorted(
+            Path(folder, name) for folder, _, names in folders for name in names if name.endswith(".parquet")
+        )
         if not paths:
             raise TacpipeError(
                 f"{self.root / 'meta/episodes'} holds no Parquet file; a dataset of version 3.0 has one."
@@ -141,6 +151,7 @@ class LeRobotDescription:
                 yield self._episode_from_row(path, row)
 
     def _episode_from_row(self, path: Path, row: Values) -> EpisodeDescription:
+        """Return the episode that a row of ``path`` describes. Raises `TacpipeError` if the row has no valid numbers."""
         try:
             index, length = int(row["episode_index"]), int(row["length"])
             values = {"chunk_index": int(row["data/chunk_index"]), "file_index": int(row["data/file_index"])}
@@ -157,9 +168,9 @@ class LeRobotDescription:
         videos = {}
         starts_s = {}
         for key in self._videos:
-            at = {name: row.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
-            if None not in at.values():
-                videos[key] = self._format_path("video_path", "", {**at, "video_key": key})
+            file_numbers = {name: row.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
+            if None not in file_numbers.values():
+                videos[key] = self._format_path("video_path", "", {**file_numbers, "video_key": key})
                 start_s = row.get(f"videos/{key}/from_timestamp")
                 starts_s[key] = float(start_s) if isinstance(start_s, int | float) else 0.0
         file = self._format_path("data_path", DATA_PATHS["v3"], values)
@@ -181,9 +192,12 @@ class LeRobotDescription:
     def _videos(self) -> list[str]:
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
-    def _format_path(self, key: str, usual: str, values: Mapping[str, str | int | None]) -> str:
-        """Return a path in the dataset from a pattern in info.json."""
-        pattern = str(self.info.get(key) or usual)
+    def _format_path(self, key: str, default: str, values: Mapping[str, str | int | None]) -> str:
+        """Return a path in the dataset from a pattern in info.json, by default ``usual``.
+
+        Raises `TacpipeError` if the pattern contains an unknown name.
+        """
+        pattern = str(self.info.get(key) or default)
         try:
             path = _PLACE.sub(lambda match: _format_number(values[match[1]], match[2]), pattern)
         except (KeyError, ValueError) as error:
@@ -209,10 +223,10 @@ def read_description(root: Path) -> LeRobotDescription:
     features = info.get("features")
     if not isinstance(features, dict) or not features:
         raise TacpipeError(f"{path}: features is {excerpt(features)}; it must name the columns of the frames.")
-    about = _read_json(root, ABOUT).get("features") if (root / ABOUT).is_file() else None
-    about = about if isinstance(about, dict) else {}
+    declared_by_tacpipe = _read_json(root, ABOUT).get("features") if (root / ABOUT).is_file() else None
+    declared_by_tacpipe = declared_by_tacpipe if isinstance(declared_by_tacpipe, dict) else {}
     parsed_features = {
-        str(key): _parse_feature(path, str(key), value, about.get(key)) for key, value in features.items()
+        str(key): _parse_feature(path, str(key), value, declared_by_tacpipe.get(key)) for key, value in features.items()
     }
     return LeRobotDescription(root, version, float(fps), str(info.get("robot_type") or ""), parsed_features, info)
 
@@ -234,22 +248,27 @@ def parquet_errors(path: Path) -> Iterator[None]:
 
 
 def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescription:
+    """Return the feature ``key`` with ``value``, its entry in info.json, and ``about``, its entry in an exported dataset.
+
+    Raises `TacpipeError` if the entry has no dtype or shape.
+    """
     shape = value.get("shape") if isinstance(value, dict) else None
     if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
         raise TacpipeError(f"{path}: the feature {plain(key)} is {excerpt(value)}; it must have dtype and shape.")
     feature = FeatureDescription(key, str(value.get("dtype")), tuple(shape))
-    about = about if isinstance(about, dict) else {}
+    exported = about if isinstance(about, dict) else {}
 
     def texts_per_value(texts: Any) -> tuple[str, ...]:
-        return tuple(leaves) if len(leaves := _leaves(texts)) == feature.width else ()
+        leaves = _leaves(texts)
+        return tuple(leaves) if len(leaves) == feature.width else ()
 
-    names = texts_per_value(about.get("columns")) or texts_per_value(value.get("names"))
+    names = texts_per_value(exported.get("columns")) or texts_per_value(value.get("names"))
     unique = names if len(set(names)) == len(names) else ()
     return replace(
         feature,
         names=unique,
-        units=texts_per_value(about.get("units")),
-        quantities=texts_per_value(about.get("quantities")),
+        units=texts_per_value(exported.get("units")),
+        quantities=texts_per_value(exported.get("quantities")),
     )
 
 
@@ -280,6 +299,10 @@ def _plain_attributes(values: Mapping[str, Attribute]) -> dict[str, Attribute]:
 
 
 def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
+    """Return the attributes in a JSON text of an exported dataset, or None without a text.
+
+    Raises `TacpipeError` if it is not JSON.
+    """
     if not isinstance(text, str):
         return None
     try:
@@ -295,6 +318,7 @@ def _format_number(value: object, width: str | None) -> str:
 
 
 def _read_json(root: Path, name: str) -> Any:
+    """Return the JSON object in a file of the dataset. Raises `TacpipeError` if it is none."""
     path = regular.inside(root, name)
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
@@ -308,7 +332,7 @@ def _read_json(root: Path, name: str) -> Any:
 
 
 def _read_json_lines(path: Path) -> Iterator[Values]:
-    """Yield the objects in a JSON Lines file."""
+    """Yield the objects in a JSON Lines file. Raises `TacpipeError` with the line of anything else."""
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
     for number, line in enumerate(content.splitlines(), 1):

@@ -108,14 +108,14 @@ class NumpyArchive:
 
     @functools.cached_property
     def _column_sources(self) -> dict[str, tuple[str, int | None]]:
-        """The array of each column, and the column's position in a row of it."""
-        places: list[tuple[str, tuple[str, int | None]]] = []
+        """The array of each column, and the column's position in a row of it; None for an array with one value per row."""
+        sources: list[tuple[str, tuple[str, int | None]]] = []
         for name, array in self._arrays.items():
             if array.width is None:
-                places.append((name, (name, None)))
+                sources.append((name, (name, None)))
             else:
-                places += [(f"{name}_{at}", (name, at)) for at in range(array.width)]
-        return container.parts_by_name(places, self.path, "column")
+                sources += [(f"{name}_{position}", (name, position)) for position in range(array.width)]
+        return container.parts_by_name(sources, self.path, "column")
 
     def arrays(self) -> Mapping[str, ArrayMember]:
         """Return the arrays with rows by name."""
@@ -160,6 +160,7 @@ class NumpyArchive:
 
     @functools.cached_property
     def _arrays(self) -> dict[str, ArrayMember]:
+        """The arrays of the file by name. Raises `TacpipeError` if two have the same name."""
         with self._convert_errors(), self._archive() as archive:
             members = [
                 ArrayMember.from_archive(archive, info, self.time_axis)
@@ -282,7 +283,7 @@ class ArrayMember:
 
     @contextlib.contextmanager
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:
-        """Yield a function that returns the next rows (time, value); raises `ValueError` if there are fewer."""
+        """Yield a function that returns the next ``rows`` rows (time, value); it raises `ValueError` if there are fewer."""
         with archive.open(self.member) as file:
             _read_header(file)
             if self.columnwise or self.time_axis:
@@ -302,6 +303,10 @@ class ArrayMember:
 
 
 def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, whether the order is Fortran's, and type from an array's header.
+
+    Raises `ValueError` for an unknown format.
+    """
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in read:
@@ -352,7 +357,10 @@ class JsonLines:
 
     @functools.cached_property
     def _kinds(self) -> dict[str, pa.DataType]:
-        """The type of each column that represents the values of all lines, in order of first appearance."""
+        """The type of each column that represents the values of all lines, in order of first appearance.
+
+        Raises `TacpipeError` if there is no such type.
+        """
         schemas: list[pa.Schema] = []
         widths: dict[str, int] = {}
         for block in self._blocks():
@@ -365,6 +373,7 @@ class JsonLines:
         return {field.name: field.type for field in full_schema}
 
     def _blocks(self) -> Iterator[pa.Table]:
+        """Yield the lines as tables. Raises `TacpipeError` if a line is too long or not a JSON object."""
         with text.open_text(self.path) as file:
             remainder = b""
             while new := file.read(BLOCK_BYTES):
@@ -377,6 +386,10 @@ class JsonLines:
             yield from self._parse_blocks(remainder)
 
     def _parse_blocks(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
+        """Yield one table of the lines in ``pieces``, or nothing if they are blank.
+
+        Raises `TacpipeError` if they are not JSON.
+        """
         if not any(_NOT_BLANK.search(piece) for piece in pieces):
             return
         try:
@@ -387,7 +400,10 @@ class JsonLines:
         yield table
 
     def _add_widths(self, block: pa.Table, widths: dict[str, int]) -> None:
-        """Add the length of the lists of each column to ``widths``. Raises `TacpipeError` if lengths differ."""
+        """Add the length of the lists in each column to ``widths``.
+
+        Raises `TacpipeError` if lengths differ within a column.
+        """
         for field in block.schema:
             if pa.types.is_list(field.type):
                 lengths = set(pc.list_value_length(block.column(field.name)).to_pylist())
@@ -413,6 +429,7 @@ class JsonLines:
 
 
 def _refuse_nested(path: Path, table: pa.Table) -> pa.Table:
+    """Return ``table``. Raises `TacpipeError` if a column is nested."""
     for field in table.schema:
         if pa.types.is_nested(field.type):
             raise TacpipeError(

@@ -142,7 +142,7 @@ def taxel_pattern(match: str, quantity: str, kind: str) -> str:
 
 
 def numbered_pattern(name: str) -> str:
-    """Return a name with its numbers as placeholders.
+    """Return a name with its numbers as placeholders, which are named after the preceding word.
 
     >>> numbered_pattern("taxel3_x"), numbered_pattern("t12"), numbered_pattern("r1c2")
     ('taxel{taxel}_x', 't{number}', 'r{r}c{c}')
@@ -152,12 +152,8 @@ def numbered_pattern(name: str) -> str:
 
     def placeholder(number: re.Match[str]) -> str:
         word = number[1].strip("_ .").lower()
-        label = (
-            word
-            if (word.isidentifier() and len(word) > 1) or (name.count(word) and len(re.findall(r"\d+", name)) > 1)
-            else "number"
-        )
-        label = label if label.isidentifier() else "number"
+        is_label = len(word) > 1 or (name.count(word) and len(re.findall(r"\d+", name)) > 1)
+        label = word if is_label and word.isidentifier() else "number"
         while label in labels:
             label = f"{label}{next(counter)}"
         labels.add(label)
@@ -227,10 +223,10 @@ _ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # name, and the meaning for
 _UNREAL = ("sin", "cos")  # sine and cosine of an angle are not angles
 
 
-def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeaning]:
+def meanings(name: str, width: int, are_integers: bool = False) -> list[ColumnMeaning]:
     """Return the meaning of each of ``width`` columns of the array ``name``.
 
-    ``integers``: whether its values are integers.
+    ``are_integers``: whether its values are integers.
 
     >>> meanings("robot0_eef_pos", 3)[0], meanings("obs/joint_pos", 7)[6].unit
     (ColumnMeaning(quantity='position', unit='m', component='x'), 'rad')
@@ -253,8 +249,8 @@ def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeanin
         return [NO_MEANING] * width
     for pattern, meaning in _ANY_WIDTH:
         if re.fullmatch(pattern, text):
-            counted = meaning.quantity == "tactile" and integers
-            return [ColumnMeaning("tactile", "count") if counted else meaning] * width
+            is_count = meaning.quantity == "tactile" and are_integers
+            return [ColumnMeaning("tactile", "count") if is_count else meaning] * width
     return [NO_MEANING] * width
 
 
@@ -271,9 +267,9 @@ def meaning_from_name(name: str, kind: str) -> ColumnMeaning:
 def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
     """Return the column meanings of an ALOHA array: arms of six joints and a gripper that is open at 1; None for others.
 
-    ``effort`` is the motor current in a unit of ALOHA's.
+    ``effort`` is the motor current in a unit of ALOHA's own.
 
-    >>> [one.quantity for one in aloha_meanings("observations/qpos", 14)][5:8]
+    >>> [meaning.quantity for meaning in aloha_meanings("observations/qpos", 14)][5:8]
     ['joint_position', 'state', 'joint_position']
     """
     last = name.rpartition("/")[2]

@@ -80,16 +80,16 @@ def choose_columns(
         if not rule.skip:
             chosen_columns.append(ChosenColumn(name, _column_field(rule, name, values, declared.get(name)), rule))
     chosen_columns = _place_cells(chosen_columns, path, stream)
-    idle = [rule.match for rule in stream.columns if rule not in used]
-    if idle:
+    unused = [rule.match for rule in stream.columns if rule not in used]
+    if unused:
         raise TacpipeError(
-            f"{path} has no column that matches {listed(idle, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
+            f"{path} has no column that matches {listed(unused, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
         )
     out = [column.field.name for column in chosen_columns]
-    doubled = sorted({name for name in out if out.count(name) > 1})
-    if doubled or TIME in out:
+    repeated = sorted({name for name in out if out.count(name) > 1})
+    if repeated or TIME in out:
         raise TacpipeError(
-            f"{path}: [streams.{stream.name}] gives more than one column the name {listed(doubled or [TIME], 3)}; "
+            f"{path}: [streams.{stream.name}] gives more than one column the name {listed(repeated or [TIME], 3)}; "
             f"each name may be there once, and {TIME} is the time."
         )
     if not chosen_columns:
@@ -123,40 +123,45 @@ def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: Strea
 def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
     """Return the field of a cell by its index in the array of a rule's shape.
 
-    A tactile cell has a taxel and an axis, another cell an index and a component; both count from 1.
+    A tactile cell has a taxel and an axis, another cell an index and a component; taxel and index count from 1.
     """
     rule = column.rule
     index = list(np.unravel_index(cell, rule.shape))
     sides = list(rule.shape)
     axis = ""
     if rule.axes:
-        along = len(sides) - 1 if sides[-1] == len(rule.axes) else 0
-        axis = rule.axes[int(index.pop(along))]
-        sides.pop(along)
+        axis_position = len(sides) - 1 if sides[-1] == len(rule.axes) else 0
+        axis = rule.axes[int(index.pop(axis_position))]
+        sides.pop(axis_position)
     number = int(np.ravel_multi_index(index, sides)) + 1 if sides else 1
     count = math.prod(sides)
-    tactile = rule.quantity in ("", "tactile")
-    about = {"taxel": str(number)} if tactile else {"index": str(number)} if count > 1 else {}
-    about |= {"axis" if tactile else "component": axis} if axis else {}
+    is_tactile = rule.quantity in ("", "tactile")
+    metadata = {"taxel" if is_tactile else "index": str(number)} if is_tactile or count > 1 else {}
+    metadata |= {"axis" if is_tactile else "component": axis} if axis else {}
     padded = str(number).zfill(max(2, len(str(count))))
     values = pattern.match(rule.match, column.name) or {}
-    stem = "taxel" if tactile else column.name.rstrip("0123456789").rstrip("_")
-    plain_name = f"{stem}{padded if tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
+    stem = "taxel" if is_tactile else column.name.rstrip("0123456789").rstrip("_")
+    plain_name = f"{stem}{padded if is_tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
     name = pattern.fill_pattern(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
     declared_metadata = field_metadata(column.field)
     retained = {key: value for key, value in declared_metadata.items() if key not in values}
-    return pa.field(name, column.field.type, metadata={**retained, **about, **dict(rule.about)})
+    return pa.field(name, column.field.type, metadata={**retained, **metadata, **dict(rule.about)})
 
 
 def _column_field(rule: ColumnRule, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
+    """Return the field of a column ``name`` that matches a rule with the placeholders ``values``.
+
+    ``declared`` is the field in the file, or None; the rule replaces only the properties that it sets.
+    """
     column_name = pattern.fill_pattern(rule.name, values) if rule.name and not rule.shape else name.strip()
-    about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
-    about = {key: value for key, value in about.items() if value}
+    metadata = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
+    metadata = {key: value for key, value in metadata.items() if value}
     if declared is None:
-        return pa.field(column_name, TYPES[rule.type or "float64"], metadata=about)
-    kind = TYPES[rule.type] if rule.type else (declared.type if rule.scale == 1.0 else pa.float64())
+        return pa.field(column_name, TYPES[rule.type or "float64"], metadata=metadata)
+    unscaled = declared.type if rule.scale == 1.0 else pa.float64()
+    kind = TYPES[rule.type] if rule.type else unscaled
     declared_metadata = field_metadata(declared)
-    return pa.field(column_name, kind, metadata={**declared_metadata, **about})
+    return pa.field(column_name, kind, metadata={**declared_metadata, **metadata})
 
 
 def convert_column(
@@ -202,6 +207,7 @@ def _is_finite(column: pa.ChunkedArray) -> bool:
 
 
 def _fits(value: pa.Scalar, kind: pa.DataType) -> bool:
+    """Return whether a value can be cast to a type."""
     try:
         value.cast(kind)
     except pa.ArrowInvalid:

@@ -88,6 +88,7 @@ class ContainerCommand:
         return read_recording(self.parsed(params), self.kind, files, values)
 
     def _find_recordings(self, layout: layouts.Layout, source: Path) -> list[recordings.RecordingFiles]:
+        """Return the recordings of a source: its containers, or those that the patterns of the layout match."""
         from tacpipe.formats.table import recordings
 
         if layout.found_by_format:
@@ -132,22 +133,24 @@ class _ContainerShares:
         self._opened: dict[Path, object] = {}
 
     def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], Values]:
+        """Return the files of a recording by name, and metadata of shared containers that it depends on."""
         files: dict[str, Path] = {}
         values: dict[str, Values] = {}  # values by name of a file
-        by_place: dict[Path, list[str]] = {}
-        for name, place in recording.files.items():
-            by_place.setdefault(place, []).append(name)
-        for place, names in by_place.items():
-            share = self._share(place, names, recording.episode) if place.is_dir() else None
+        names_by_path: dict[Path, list[str]] = {}
+        for name, path in recording.files.items():
+            names_by_path.setdefault(path, []).append(name)
+        for path, names in names_by_path.items():
+            share = self._share(path, names, recording.episode) if path.is_dir() else None
             if share is None:
-                files |= member_files(dict.fromkeys(names, place))
+                files |= member_files(dict.fromkeys(names, path))
                 continue
-            files |= {f"{name}/{inner_path}": path for name in names for inner_path, path in share.files.items()}
+            for name in names:
+                files |= {f"{name}/{inner_path}": inner_file for inner_path, inner_file in share.files.items()}
             if share.values:
                 values[names[0]] = dict(share.values)
         return files, values
 
-    def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
+    def _share(self, path: Path, names: Sequence[str], episode: str | None) -> Share | None:
         """Return the files that streams of a container are read from, or None for all of its files."""
         from tacpipe.formats.container import Sharing, open_container
 
@@ -155,9 +158,9 @@ class _ContainerShares:
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
         if kind in layouts.CAMERA:
             return None
-        if place not in self._opened:
-            self._opened[place] = open_container(str(kind), place)
-        container = self._opened[place]
+        if path not in self._opened:
+            self._opened[path] = open_container(str(kind), path)
+        container = self._opened[path]
         requested = [stream.source for stream in streams.values()] or None
         try:
             return container.share(requested, episode) if isinstance(container, Sharing) else None
@@ -192,14 +195,14 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
     formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(KINDS)
     folders = [path for name in formats for path in find_containers(name, source) if path.is_dir()]
 
-    def reason(path: str) -> str:
+    def explain(path: str) -> str:
         if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
             return ""
         if any((source / path).is_relative_to(folder) for folder in folders):
             return ""
         return layouts.why_unreadable(path, "no `files` of the layout matches" if layout.streams else "", kind)
 
-    return reason
+    return explain
 
 
 def read_recording(
@@ -228,8 +231,8 @@ def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
 
     return {
         f"{name}/{inner_path}" if inner_path else name: path
-        for name, place in paths.items()
-        for inner_path, path in container_files(place).items()
+        for name, path in paths.items()
+        for inner_path, path in container_files(path).items()
     }
 
 

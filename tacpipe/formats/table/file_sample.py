@@ -91,13 +91,13 @@ def detect_dialect(lines: Sequence[str]) -> Dialect:
     >>> detect_dialect(["1.5,2", "2.5,3"]).names
     ('column1', 'column2')
     """
-    texts = [line.rstrip("\r\n").removeprefix("\ufeff") for line in lines]
-    comment = next((mark for mark in COMMENTS if any(text.lstrip().startswith(mark) for text in texts)), "")
-    data_lines = [text for text in texts if text.strip() and not (comment and text.lstrip().startswith(comment))]
+    line_texts = [line.rstrip("\r\n").removeprefix("\ufeff") for line in lines]
+    comment = next((mark for mark in COMMENTS if any(text.lstrip().startswith(mark) for text in line_texts)), "")
+    data_lines = [text for text in line_texts if text.strip() and not (comment and text.lstrip().startswith(comment))]
     separator, width = _guess_separator(data_lines)
     cells = [tuple(cell.strip() for cell in next(csv.reader([text], delimiter=separator))) for text in data_lines]
-    skip = next((number for number, row in enumerate(cells) if len(row) == width), 0)
-    rows = [row for row in cells[skip:] if len(row) == width]
+    header_row = next((number for number, row in enumerate(cells) if len(row) == width), 0)
+    rows = [row for row in cells[header_row:] if len(row) == width]
     decimal = _guess_decimal(rows, separator)
     probe = Dialect(separator, decimal, comment, 0, False, (), ())
     header = bool(rows) and _is_header(rows, probe)
@@ -105,14 +105,16 @@ def detect_dialect(lines: Sequence[str]) -> Dialect:
     units: tuple[str, ...] = ()
     if header and len(rows) > 2 and _is_text(rows[1], probe) and not _is_text(rows[2], probe):
         units, rows = rows[1], [rows[0], *rows[2:]]
-    below = rows[1:] if header else rows
-    missing = sorted({cell for row in below for cell in row if cell in MISSING})
-    before = 0
+    data_rows = rows[1:] if header else rows
+    missing = sorted({cell for row in data_rows for cell in row if cell in MISSING})
+    skip_lines = 0
     if units:  # the first row after the units
-        before = next(number for number, text in enumerate(texts) if text == data_lines[skip + 1]) + 1
-    elif skip:  # number of lines before the header, including comments and blank lines
-        before = next(number for number, text in enumerate(texts) if text == data_lines[skip])
-    return Dialect(separator, decimal, comment, before, header, tuple(names), tuple(below), tuple(missing), units)
+        skip_lines = next(number for number, text in enumerate(line_texts) if text == data_lines[header_row + 1]) + 1
+    elif header_row:  # number of lines before the header, including comments and blank lines
+        skip_lines = next(number for number, text in enumerate(line_texts) if text == data_lines[header_row])
+    return Dialect(
+        separator, decimal, comment, skip_lines, header, tuple(names), tuple(data_rows), tuple(missing), units
+    )
 
 
 def _is_text(row: Sequence[str], probe: Dialect) -> bool:
@@ -121,14 +123,17 @@ def _is_text(row: Sequence[str], probe: Dialect) -> bool:
 
 
 def _guess_separator(data_lines: Sequence[str]) -> tuple[str, int]:
-    """Return the separator with which most lines have the same number of cells, and that number."""
+    """Return the separator with which most lines have the same number of cells, and that number.
+
+    Without such a separator, it is a comma and one cell.
+    """
     best = (0.0, 0, ",", 1)
     for rank, separator in enumerate(SEPARATORS):
         widths = Counter(len(next(csv.reader([text], delimiter=separator), [])) for text in data_lines)
-        wide = Counter({width: count for width, count in widths.items() if width > 1})
-        if not wide:
+        several_cells = Counter({width: count for width, count in widths.items() if width > 1})
+        if not several_cells:
             continue
-        width, count = wide.most_common(1)[0]
+        width, count = several_cells.most_common(1)[0]
         score = count / len(data_lines)
         if separator == "," and score < 1 and any(";" in text for text in data_lines):
             score /= 2  # commas may be decimal signs
@@ -145,13 +150,13 @@ def _guess_decimal(rows: Sequence[tuple[str, ...]], separator: str) -> Literal["
 
 def _is_header(rows: Sequence[tuple[str, ...]], probe: Dialect) -> bool:
     """Return whether the first row contains names: fewer numbers than the rows below it."""
-    first = [probe.number(cell) is not None for cell in rows[0]]
-    if not any(not number and cell not in MISSING for number, cell in zip(first, rows[0], strict=True)):
+    is_number = [probe.number(cell) is not None for cell in rows[0]]
+    if not any(not number and cell not in MISSING for number, cell in zip(is_number, rows[0], strict=True)):
         return False
     if len(rows) == 1:
-        return not any(first)
-    below = [probe.number(cell) is not None for cell in rows[1]]
-    return sum(first) < sum(below) or not any(first)
+        return not any(is_number)
+    is_number_below = [probe.number(cell) is not None for cell in rows[1]]
+    return sum(is_number) < sum(is_number_below) or not any(is_number)
 
 
 @dataclass(frozen=True)
@@ -230,8 +235,10 @@ def _time_axis(arrays: Mapping[str, ArrayMember]) -> int:
     It is the first axis, unless the only array has another one so much longer that the first must belong to the sensor.
     """
     shape = next(iter(arrays.values())).shape if len(arrays) == 1 else ()
-    longest = shape.index(max(shape)) if shape else 0
-    return longest if shape and len(shape) > 1 and shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
+    if len(shape) < 2:
+        return 0
+    longest = shape.index(max(shape))
+    return longest if shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
 
 
 def belongs_to(column: str, array: str) -> bool:
@@ -255,11 +262,11 @@ def column_entries(sample: FileSample, reserved: set[str]) -> list[str]:
 
 
 def _array_entries(sample: FileSample) -> tuple[list[str], set[str]]:
-    """Return an entry for each array with several values per row, and the columns of these arrays."""
+    """Return the column rules for arrays with several values per row, and the columns of these arrays."""
     rules = []
     array_columns: set[str] = set()
-    placed = [name for name, array in sample.arrays.items() if _shape(name, array)]
-    for name in placed:
+    shaped_arrays = [name for name, array in sample.arrays.items() if _shape(name, array)]
+    for name in shaped_arrays:
         array = sample.arrays[name]
         shape = _shape(name, array)
         kind = array.dtype.name if array.dtype.name in TYPES else "float64"
@@ -267,11 +274,9 @@ def _array_entries(sample: FileSample) -> tuple[list[str], set[str]]:
         quantity, unit = column_names.meaning(name, kind)
         if quantity == UNKNOWN and shape == (3,):
             quantity, unit = column_names.meaning(f"{name}_x", kind)
-        name_entry = (
-            f'name = "{name}{{taxel}}{"_{axis}" if axes else ""}", '
-            if len(placed) > 1 and quantity == "tactile"
-            else ""
-        )
+        suffix = "_{axis}" if axes else ""
+        needs_name = len(shaped_arrays) > 1 and quantity == "tactile"
+        name_entry = f'name = "{name}{{taxel}}{suffix}", ' if needs_name else ""
         rule = f"match = {quoted(f'{name}_*')}, {name_entry}quantity = {quoted(quantity)}, unit = {quoted(unit)}"
         rule += f", type = {quoted(kind)}, shape = {list(shape)}" + (f", axes = {json.dumps(axes)}" if axes else "")
         rules.append(f"{{ {rule} }},")
@@ -281,16 +286,13 @@ def _array_entries(sample: FileSample) -> tuple[list[str], set[str]]:
 
 def _shape(name: str, array: ArrayMember) -> tuple[int, ...]:
     """Return the shape of an array's rows if it places values in a sensor or a vector, else an empty tuple."""
-    vector = array.row_shape == (3,)
-    return (
-        array.row_shape
-        if len(array.row_shape) > 1 or vector or (array.width and column_names.meaning(name, "")[0] == "tactile")
-        else ()
-    )
+    is_tactile = array.width and column_names.meaning(name, "")[0] == "tactile"
+    has_positions = len(array.row_shape) > 1 or array.row_shape == (3,) or is_tactile
+    return array.row_shape if has_positions else ()
 
 
 def _column_entries(sample: FileSample, names: Sequence[str]) -> list[str]:
-    """Return one entry per set of columns whose names differ only in numbers and whose values have the same type."""
+    """Return one rule per set of columns whose names differ only in numbers and whose values have the same type."""
     by_rule: dict[tuple[str, ...], list[str]] = {}
     bases = {name: column_names.without_unit(name) for name in names}
     matches = {column_names.numbered_pattern(base) for base in bases.values()}
@@ -299,25 +301,25 @@ def _column_entries(sample: FileSample, names: Sequence[str]) -> list[str]:
         kind = _kind([value for value in sample.values[name] if value is not None])
         quantity, unit = column_names.meaning(base, kind)
         unit = sample.stated_unit(name) or unit
-        match, bracket = column_names.numbered_pattern(base), name.strip()[len(base) :]
+        match, unit_text = column_names.numbered_pattern(base), name.strip()[len(base) :]
         if quantity == "tactile" and {f"{match[:-1]}{axis}" for axis in "xyz"} <= matches:
             match = f"{match[:-1]}{{axis}}"
-        by_rule.setdefault((match, bracket, quantity, unit, kind), []).append(name)
+        by_rule.setdefault((match, unit_text, quantity, unit, kind), []).append(name)
     rules = []
-    for (match, bracket, quantity, unit, kind), members in by_rule.items():
+    for (match, unit_text, quantity, unit, kind), members in by_rule.items():
         base = bases[members[0]] if len(members) == 1 else column_names.taxel_pattern(match, quantity, kind)
-        is_place = {column_names.lower_name(bases[name]) for name in members} <= {"x", "y", "z"}
-        if quantity == UNKNOWN and kind.startswith("float") and is_place:
+        are_coordinates = {column_names.lower_name(bases[name]) for name in members} <= {"x", "y", "z"}
+        if quantity == UNKNOWN and kind.startswith("float") and are_coordinates:
             quantity = "position" if components >= set("xyzw") or unit in ("m", "cm", "mm") else quantity
         if kind == "text":
-            rules.append(f"{{ match = {quoted(base + bracket)}, skip = true }},")
+            rules.append(f"{{ match = {quoted(base + unit_text)}, skip = true }},")
             continue
-        renamed = column_names.identifier(base).lower() if bracket else column_names.identifier(base)
-        name = f"name = {quoted(renamed)}, " if renamed != base + bracket else ""
-        unlisted = len(members) >= 6 and "{" in base and not (sample.text and sample.text.header)
-        comment = '  # of an array: add shape = [16, 3], axes = ["x", "y", "z"]' if unlisted else ""
+        new_name = column_names.identifier(base).lower() if unit_text else column_names.identifier(base)
+        name = f"name = {quoted(new_name)}, " if new_name != base + unit_text else ""
+        is_unlabelled_array = len(members) >= 6 and "{" in base and not (sample.text and sample.text.header)
+        comment = '  # of an array: add shape = [16, 3], axes = ["x", "y", "z"]' if is_unlabelled_array else ""
         rules.append(
-            f"{{ match = {quoted(base + bracket)}, {name}quantity = {quoted(quantity)}, unit = {quoted(unit)}, "
+            f"{{ match = {quoted(base + unit_text)}, {name}quantity = {quoted(quantity)}, unit = {quoted(unit)}, "
             f"type = {quoted(kind)} }},{comment}"
         )
     return sorted(rules, key=lambda rule: rule.partition("quantity")[0].count("{"))  # exact names before patterns
@@ -350,21 +352,23 @@ _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 
 def time_column(sample: FileSample) -> str | None:
     """Return the column named like timestamps, else the first column if its numbers increase, else None."""
-    rising = [name for name in sample.names if rises(sample.values[name]) and not label_table.RECORDING.fullmatch(name)]
-    stamped = {
+    increasing = [
+        name for name in sample.names if increases(sample.values[name]) and not label_table.RECORDING.fullmatch(name)
+    ]
+    timestamp_like = {
         name
         for name in sample.names
-        if name in rising
+        if name in increasing
         or any(isinstance(value, str | datetime.datetime | datetime.time) for value in sample.values[name])
     }
     for time_name in (column_names.TIME_NAME, column_names.TIME_ENDING):
         for name in sample.names:
-            if name in stamped and time_name.fullmatch(column_names.without_unit(name)):
+            if name in timestamp_like and time_name.fullmatch(column_names.without_unit(name)):
                 return name
-    return rising[0] if rising and rising[0] == sample.names[0] else None
+    return increasing[0] if increasing and increasing[0] == sample.names[0] else None
 
 
-def rises(values: Sequence[float | str | None]) -> bool:
+def increases(values: Sequence[float | str | None]) -> bool:
     """Return whether all values are numbers that never decrease, with the last above the first."""
     numbers = [value for value in values if isinstance(value, int | float)]
     return (

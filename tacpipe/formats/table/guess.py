@@ -69,10 +69,10 @@ def guess_layout(folder: Path) -> str:
     if not groups:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
     trees = _label_files(folder, [path for path in all_paths if path.suffix.lower() in TREES], groups)
-    in_groups = [*(group.paths for group in [*groups, *stamps, *labels]), *trees.values()]
-    read_files = [folder / path for paths in [*in_groups, *(group.members for group in groups)] for path in paths]
+    grouped_paths = [*(group.paths for group in [*groups, *stamps, *labels]), *trees.values()]
+    read_files = [folder / path for paths in [*grouped_paths, *(group.members for group in groups)] for path in paths]
 
-    def reason(path: str) -> str:
+    def explain(path: str) -> str:
         return damaged.get(path) or why_unreadable(
             path, "it is no stream, and no file of labels that each recording has"
         )
@@ -81,17 +81,17 @@ def guess_layout(folder: Path) -> str:
     parts += [_labels_text(group) for group in labels]
     parts += [f"[[labels]]\nfile = {quoted(text)}" for text in trees]
     parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
-    head = [
+    header = [
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
-        *(f"# {shown(line)}" for line in container.describe_unread(folder, read_files, reason)),
+        *(f"# {shown(line)}" for line in container.describe_unread(folder, read_files, explain)),
     ]
-    return "\n\n".join(["\n".join(head), *parts]) + "\n"
+    return "\n\n".join(["\n".join(header), *parts]) + "\n"
 
 
 def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], list[_FileGroup], dict[str, str]]:
-    """Return the groups of files that are streams, the groups of label files, and the reason for each unusable path."""
+    """Return the groups of stream files, the groups of label files, and for each unusable path, the reason."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
         by_template.setdefault(_template(path), []).append(path)
@@ -132,19 +132,21 @@ def _camera_groups(
         by_template.setdefault((_template(path), path in folders), []).append(path)
     groups = []
     for (_, are_folders), paths in by_template.items():
-        for alike in _group_by_file_name(paths):
+        for same_stream in _group_by_file_name(paths):
             try:
-                entries, count = (_image_entries if are_folders else _video_entries)(folder / alike[0])
+                entries, count = (_image_entries if are_folders else _video_entries)(folder / same_stream[0])
             except MissingModuleError:
                 raise
             except TacpipeError as error:
-                damaged |= {path.as_posix(): str(error).rstrip(".") for path in alike}
+                damaged |= {path.as_posix(): str(error).rstrip(".") for path in same_stream}
                 continue
             sample = FileSample((), {}, frames=count)
-            members = tuple(path for path in images if path.parent in alike) if are_folders else ()
-            name = _stream_name(alike, used)
+            members = tuple(path for path in images if path.parent in same_stream) if are_folders else ()
+            name = _stream_name(same_stream, used)
             groups.append(
-                _FileGroup(name, pattern.generalize(alike), tuple(alike), sample, camera=entries, members=members)
+                _FileGroup(
+                    name, pattern.generalize(same_stream), tuple(same_stream), sample, camera=entries, members=members
+                )
             )
     return groups
 
@@ -156,27 +158,30 @@ def _video_entries(path: Path) -> tuple[tuple[str, ...], int]:
 
 
 def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
-    """Return the layout entries and the number of images of a folder. Large numbers in names are timestamps."""
+    """Return the layout entries and the number of images of a folder. Large numbers in file names are timestamps."""
     paths = reading.image_paths(folder)
     numbers = [reading.last_number(path) for path in paths]
     values = tuple(float(number) if "." in number else int(number) for number in numbers if number is not None)
     is_stamp = len(values) == len(paths) and min(values) >= 1e8
-    time = file_sample.time_entry(FileSample((IMAGE_NAME,), {IMAGE_NAME: values}), IMAGE_NAME) if is_stamp else ""
-    ending = "" if is_stamp else f'time = {{ rate_hz = "{UNKNOWN}" }}  # the names hold no stamps'
-    lines = ('format = "images"', f"# {scan_images(paths[:1]).describe()}", f"time = {time}" if time else ending)
-    return lines, len(paths)
+    time = f'{{ rate_hz = "{UNKNOWN}" }}  # the names hold no stamps'
+    if is_stamp:
+        time = file_sample.time_entry(FileSample((IMAGE_NAME,), {IMAGE_NAME: values}), IMAGE_NAME)
+    return ('format = "images"', f"# {scan_images(paths[:1]).describe()}", f"time = {time}"), len(paths)
 
 
 def _group_by_length(group: _FileGroup) -> list[_FileGroup]:
-    """Return one stream per length of the arrays in a file; files without arrays are one stream."""
+    """Return the streams of the arrays in a file: one per array of images, and one per length of the other arrays.
+
+    A file without arrays is one stream.
+    """
     pictures = [name for name, array in group.first.arrays.items() if array.is_pictures]
     if pictures:
         others = [name for name in group.first.arrays if name not in pictures]
         clock = file_sample.time_column(group.first.only(others)) if others else None
         streams = [_picture_group(group, name, clock) for name in pictures]
         if set(others) - {clock}:
-            rest = replace(group, first=group.first.only(others), skipped=tuple(pictures))
-            streams += _group_by_length(rest)
+            without_pictures = replace(group, first=group.first.only(others), skipped=tuple(pictures))
+            streams += _group_by_length(without_pictures)
         return streams
     by_length: dict[int, list[str]] = {}
     for name, array in group.first.arrays.items():
@@ -204,7 +209,10 @@ def _picture_group(group: _FileGroup, array: str, clock: str | None) -> _FileGro
 
 
 def _match_stamp_files(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:
-    """Return the streams and the groups of timestamp files. A stream without timestamps gets the file of equal length."""
+    """Return the streams, and the groups of timestamp files that they use.
+
+    A stream without timestamps gets a file of one column and equal length in its folder.
+    """
     clocks = [group for group in groups if len(group.first.names) == 1 and _is_clock(group)]
     used: list[_FileGroup] = []
     streams: list[_FileGroup] = []
@@ -231,7 +239,7 @@ def _is_clock(group: _FileGroup) -> bool:
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
     (values,) = group.first.values.values()
-    return bool(match) and (file_sample.rises(values) or any(isinstance(value, str) for value in values))
+    return bool(match) and (file_sample.increases(values) or any(isinstance(value, str) for value in values))
 
 
 def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
@@ -239,30 +247,31 @@ def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
     stem = re.sub(r"\{\w+\}", "", pattern.generalize([Path(path.name) for path in paths])).partition(".")[0].lower()
     name = re.sub(r"[^a-z0-9]+", "_", stem).replace("trial", "").strip("_")
     name = name if name.isidentifier() else "table"
-    name = name if name not in used else next(f"{name}{n}" for n in itertools.count(2) if f"{name}{n}" not in used)
-    used.add(name)
-    return name
+    candidates = itertools.chain([name], (f"{name}{number}" for number in itertools.count(2)))
+    unused = next(candidate for candidate in candidates if candidate not in used)
+    used.add(unused)
+    return unused
 
 
 def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_FileGroup]) -> dict[str, list[Path]]:
-    """Return YAML and JSON label files by pattern: one file per recording, or one for all recordings."""
+    """Return YAML and JSON label files by pattern, for patterns with one file per recording or one file for all."""
     by_template: dict[str, list[Path]] = {}
     for path in paths:
         by_template.setdefault(_template(path), []).append(path)
     shared = set.intersection(*(set(pattern.placeholders(group.pattern)) for group in streams))
     recordings = [pattern.match(streams[0].pattern, path.as_posix()) or {} for path in streams[0].paths]
     labels = {}
-    for same in by_template.values():
-        text, names = pattern.generalize(same), {path.as_posix() for path in same}
+    for same_template in by_template.values():
+        text, names = pattern.generalize(same_template), {path.as_posix() for path in same_template}
         placeholders = set(pattern.placeholders(text))
         if not placeholders:
-            is_labels = _is_table_of_labels(folder / same[0])
+            is_labels = _is_table_of_labels(folder / same_template[0])
         else:
             is_labels = (
                 placeholders <= shared and {pattern.fill_pattern(text, values) for values in recordings} <= names
             )
         if is_labels:
-            labels[text] = same
+            labels[text] = same_template
     return labels
 
 
@@ -348,10 +357,10 @@ def _text_entries(sample: FileSample, path: Path) -> list[str]:
     """Return the entries for encoding, separator and header of a text file that differ from the defaults."""
     text = sample.text
     assert text is not None
-    usual = "\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ","
+    default_separator = "\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ","
     entries = [
         ("encoding", sample.encoding, "utf-8"),
-        ("separator", text.separator, usual),
+        ("separator", text.separator, default_separator),
         ("decimal", text.decimal, "."),
         ("comment", text.comment, ""),
     ]

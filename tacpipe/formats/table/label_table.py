@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -30,29 +31,30 @@ def plain_value(text: str) -> Attribute:
     >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
     [3, 0.5, '007', True, 'cork', None, 'nan']
     """
-    text = text.strip()
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    if not text:
+    stripped = text.strip()
+    if stripped.lower() in ("true", "false"):
+        return stripped.lower() == "true"
+    if not stripped:
         return None
-    digits = text.lstrip("-")
+    digits = stripped.lstrip("-")
     if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
-        return int(text) if len(digits) < 19 else text
+        return int(stripped) if len(digits) < 19 else stripped
     try:
-        number = float(text)
+        number = float(stripped)
     except ValueError:
-        return text
-    finite = number == number and abs(number) != float("inf")
-    return number if finite and not digits.startswith("00") and "_" not in text and not digits.isdigit() else text
+        return stripped
+    is_number = math.isfinite(number) and not digits.startswith("00") and "_" not in stripped and not digits.isdigit()
+    return number if is_number else stripped
 
 
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each non-empty line, the header first; all lines must be as wide as the header.
+    """Yield number and cells of each non-empty line, the header first.
 
-    Raises `TacpipeError` otherwise.
+    Raises `TacpipeError` if a line has another number of cells than the header.
     """
     text = read_text(path)
-    separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
+    separator = ";" if ";" in text.partition("\n")[0] else ","
+    separator = "\t" if path.suffix.lower() == ".tsv" else separator
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header: list[str] = []
     for cells in reader:
@@ -152,15 +154,16 @@ def read_label_table(
         raise UsageError(f"{path} is not a table of labels by its name; give one of {', '.join(EXTENSIONS)}.")
     if not path.is_file():
         raise UsageError(f"There is no file {path}.")
-    texts = suffix in (".csv", ".tsv")
-    rows = list(_read_text_rows(path) if texts else _read_parquet(path) if suffix == ".parquet" else _read_tree(path))
+    is_text = suffix in (".csv", ".tsv")
+    read_other = _read_parquet if suffix == ".parquet" else _read_tree
+    rows = list(_read_text_rows(path) if is_text else read_other(path))
     if not rows:
         raise UsageError(f"{path} holds no row; nothing would change.")
     columns = list(dict.fromkeys(name for _, row in rows for name in row))
     if key and key not in columns:
         raise UsageError(f"{path} has no column {plain(key)}; it has {listed(columns)}.")
-    key = key or _find_key_column(path, columns, rows, set(attributes_by_name or ()))
-    return LabelTable(path, key, tuple(_checked_row(path, place, key, row, texts) for place, row in rows))
+    key_column = key or _find_key_column(path, columns, rows, set(attributes_by_name or ()))
+    return LabelTable(path, key_column, tuple(_label_row(path, place, key_column, row, is_text) for place, row in rows))
 
 
 Cell = Attribute | datetime.date  # a value of a table; others are refused
@@ -169,31 +172,37 @@ Cell = Attribute | datetime.date  # a value of a table; others are refused
 def _find_key_column(
     path: Path, columns: list[str], rows: list[tuple[str, dict[str, Cell]]], recording_names: set[str]
 ) -> str:
+    """Return the column with the names of recordings. Raises `UsageError` if no column can be it."""
     matching_columns = [name for name in columns if {cell_text(row.get(name)) for _, row in rows} <= recording_names]
-    called = [name for name in columns if RECORDING.fullmatch(name)]
-    if not matching_columns + called:
+    named_like_key = [name for name in columns if RECORDING.fullmatch(name)]
+    if not matching_columns + named_like_key:
         raise UsageError(
             f"No column of {path} is called recording or trial or holds names of recordings; name it with --key: "
             f"{listed(columns)}."
         )
-    return (matching_columns + called)[0]
+    return (matching_columns + named_like_key)[0]
 
 
-def _checked_row(path: Path, place: str, key: str, row: Mapping[str, Cell], texts: bool) -> LabelRow:
+def _label_row(path: Path, place: str, key: str, row: Mapping[str, Cell], is_text: bool) -> LabelRow:
+    """Return a row of labels; ``place`` describes it in errors, and cells of a text table (``texts``) are parsed.
+
+    Raises `TacpipeError` if the row has no name or an invalid label.
+    """
     name = cell_text(row.get(key))
     if not name:
         raise TacpipeError(f"{path}, {place} has no {plain(key)}. Write the name of its recording, or remove the row.")
     values = {label: value for label, value in row.items() if label != key}
-    if texts:
+    if is_text:
         values = {label: plain_value(str(value)) for label, value in values.items() if value}
     return LabelRow(place, name, {label: _label_value(path, place, label, value) for label, value in values.items()})
 
 
 def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
+    """Return a label's value; dates become text. Raises `TacpipeError` if it is not plain."""
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
-    finite = not isinstance(value, float) or value - value == 0
-    if finite and (value is None or isinstance(value, str | int | float | bool)):
+    is_finite = not isinstance(value, float) or value - value == 0
+    if is_finite and (value is None or isinstance(value, str | int | float | bool)):
         return value
     raise TacpipeError(
         f"{path}, {place}: {plain(label)} is {excerpt(value)}; a label is text, a finite number, or true or false."
@@ -201,7 +210,7 @@ def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
 
 
 def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
-    """Yield the cells of each row of a text table by the names of its header."""
+    """Yield the place of each row of a text table, and its cells by the names of the header."""
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     for line, cells in numbered:
@@ -209,6 +218,10 @@ def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
 
 
 def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
+    """Yield the place of each row of a Parquet file, and its cells that are not null, by column.
+
+    Raises `TacpipeError` if the file is damaged.
+    """
     from tacpipe.io import parquet, regular
 
     with regular.failing(path):
@@ -222,22 +235,22 @@ def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
 
 
 def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
-    """Yield the entries of a mapping of names to labels, or of a list of labels."""
+    """Yield the place and the labels of each entry of a mapping of names to labels, or of a list of labels.
+
+    Raises `TacpipeError` if the file is neither, or an entry is not a mapping.
+    """
     text = read_text(path)
     try:
         tree = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
-    entries = (
-        [
-            (plain(str(name)), {NAME: str(name), **labels} if isinstance(labels, dict) else labels)
-            for name, labels in tree.items()
-        ]
-        if isinstance(tree, dict)
-        else [(f"entry {number}", labels) for number, labels in enumerate(tree)]
-        if isinstance(tree, list)
-        else []
-    )
+    entries: list[tuple[str, Any]] = []
+    if isinstance(tree, dict):
+        for name, labels in tree.items():
+            named_labels = {NAME: str(name), **labels} if isinstance(labels, dict) else labels
+            entries.append((plain(str(name)), named_labels))
+    elif isinstance(tree, list):
+        entries += [(f"entry {number}", labels) for number, labels in enumerate(tree)]
     for place, labels in entries:
         if not isinstance(labels, dict):
             raise TacpipeError(

@@ -32,13 +32,13 @@ def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles])
         for source in sources
     }
     for labels in layout.labels:
-        shared = not pattern.placeholders(labels.file)
-        rows = _labels_by_key(folder / labels.file, labels) if shared else {}
+        is_shared = not pattern.placeholders(labels.file)
+        rows = _labels_by_key(folder / labels.file, labels) if is_shared else {}
         for source in sources:
-            called = _alternative_names(layout, source)
+            alternative_names = _alternative_names(layout, source)
             values = (
-                _find_row(rows, source, called, folder / labels.file)
-                if shared
+                _find_row(rows, source, alternative_names, folder / labels.file)
+                if is_shared
                 else _read_label_file(folder, labels, source)
             )
             labels_by_name[source.name] |= _select_columns(values, labels, source.name)
@@ -53,7 +53,7 @@ def _placeholder_values(source: RecordingFiles) -> Iterator[tuple[str, str]]:
 
 
 def _read_single_row(path: Path) -> dict[str, Attribute]:
-    """Return the single row of a table that describes one recording."""
+    """Return the single row of a table that describes one recording. Raises `TacpipeError` for another number of rows."""
     rows = list(read_rows(path))
     if len(rows) != 2:
         raise TacpipeError(
@@ -63,21 +63,24 @@ def _read_single_row(path: Path) -> dict[str, Attribute]:
 
 
 def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attribute]]:
-    """Return the rows of a label table by key; the keys of a YAML or JSON mapping are its names."""
+    """Return the rows of a label table by key; the keys of a YAML or JSON mapping are its names.
+
+    Raises `TacpipeError` for a missing key column and for repeated keys.
+    """
     if path.suffix.lower() in TREES:
         label_rows = label_table.read_label_table(path, labels.key)
-        doubled = [name for name, count in Counter(row.recording for row in label_rows.rows).items() if count > 1]
-        if doubled:
-            raise TacpipeError(f"{path}: {plain(doubled[0])} has an entry already. Keep one of them.")
+        repeated = [name for name, count in Counter(row.recording for row in label_rows.rows).items() if count > 1]
+        if repeated:
+            raise TacpipeError(f"{path}: {plain(repeated[0])} has an entry already. Keep one of them.")
         return {row.recording: dict(row.labels) for row in label_rows.rows}
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     if labels.key not in header:
         raise TacpipeError(f"{path} has no column {plain(labels.key)}; it has {listed(header, 6)}.")
-    at = header.index(labels.key)
+    key_index = header.index(labels.key)
     rows: dict[str, dict[str, Attribute]] = {}
     for line, cells in numbered:
-        key = cells[at]
+        key = cells[key_index]
         if key in rows:
             raise TacpipeError(f"{path}, line {line}: {plain(key)} has a row already. Keep one of them.")
         rows[key] = {name: plain_value(cell) for name, cell in zip(header, cells, strict=True) if name != labels.key}
@@ -99,9 +102,10 @@ def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
 
 
 def _find_row(
-    rows: Mapping[str, dict[str, Attribute]], source: RecordingFiles, called: list[str], path: Path
+    rows: Mapping[str, dict[str, Attribute]], source: RecordingFiles, alternative_names: list[str], path: Path
 ) -> dict[str, Attribute]:
-    candidates = (source.episode, source.name, *source.values.values(), *called)
+    """Return the row of a recording under any of its names. Raises `TacpipeError` if there is none."""
+    candidates = (source.episode, source.name, *source.values.values(), *alternative_names)
     names = list(dict.fromkeys(name for name in candidates if name is not None))
     for name in names:
         if name in rows:
@@ -113,6 +117,7 @@ def _find_row(
 
 
 def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) -> dict[str, Attribute]:
+    """Return the labels in the file of one recording. Raises `TacpipeError` if they cannot be read."""
     path = folder / pattern.fill_pattern(labels.file, {**source.values, "recording": source.episode or source.name})
     if path.suffix.lower() in (".csv", ".tsv"):
         return _read_single_row(path)
@@ -126,15 +131,16 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
     return {plain(str(name)): _label_value(value, name, path) for name, value in _flatten(values).items()}
 
 
-def _flatten(values: Mapping[Any, Any], before: str = "") -> dict[str, Attribute | datetime.date]:
+def _flatten(values: Mapping[Any, Any], prefix: str = "") -> dict[str, Attribute | datetime.date]:
     """Return nested mappings as one mapping with dotted names."""
     flat: dict[str, Attribute | datetime.date] = {}
     for name, value in values.items():
-        flat |= _flatten(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat
 
 
 def _label_value(value: Any, name: Any, path: Path) -> Attribute:
+    """Return a label's value; dates become text. Raises `TacpipeError` if it is not plain."""
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
     if value is None or isinstance(value, str | int | float | bool):
@@ -143,6 +149,7 @@ def _label_value(value: Any, name: Any, path: Path) -> Attribute:
 
 
 def _select_columns(values: dict[str, Attribute], labels: LabelSource, recording: str) -> dict[str, Attribute]:
+    """Return the labels that the layout selects, or all. Raises `TacpipeError` if one is missing."""
     if not labels.columns:
         return values
     missing = [name for name in labels.columns if name not in values]

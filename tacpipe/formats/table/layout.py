@@ -178,12 +178,12 @@ def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
         return unmatched
     if readable and kind not in readable:
         return f"`tacpipe ingest {readable[0]}` reads such files"
-    reads = (
+    formats = (
         describe_kind(kind)
         if kind is not None
         else ", ".join(f"*{ending}" for ending in (*EXTENSIONS, *CAMERA_EXTENSIONS))
     )
-    return f"the command reads {reads}"
+    return f"the command reads {formats}"
 
 
 @dataclass(frozen=True)
@@ -280,13 +280,11 @@ def _expect_known_words(layout: Layout, local: Vocabulary, place: str) -> None:
     """Raise `UsageError` for a quantity or unit that is neither built in nor declared in the layout."""
     for stream in layout.streams:
         for number, column in enumerate(stream.columns, 1):
+            quantity_fault = schema.describe_unknown_quantity(column.quantity, local.quantities)
+            unit_fault = schema.describe_unknown_unit(column.unit, local.units)
             for kind, fault, word in (
-                (
-                    "quantities",
-                    schema.describe_unknown_quantity(column.quantity, local.quantities),
-                    column.quantity,
-                ),
-                ("units", schema.describe_unknown_unit(column.unit, local.units), column.unit),
+                ("quantities", quantity_fault, column.quantity),
+                ("units", unit_fault, column.unit),
             ):
                 if fault:
                     raise UsageError(
@@ -306,7 +304,7 @@ def _refuse_unknown(value: Any, place: str) -> None:
 
 
 def _unknown_entries(value: Any, place: str) -> Iterator[str]:
-    """Yield each entry of a guessed layout that has not been filled in, with its neighbours."""
+    """Yield a sentence for each entry of a guessed layout that has not been filled in, with its neighbours."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         for element in inner if isinstance(inner, list) else [inner]:
             if element == UNKNOWN:
@@ -317,38 +315,43 @@ def _unknown_entries(value: Any, place: str) -> Iterator[str]:
 
 
 def _parse_stream(name: str, value: Any, place: str, container: Format | None) -> StreamLayout:
-    place = f"{place}, [streams.{plain(name)}]"
-    values = dict(_expect_table(value, place, ""))
+    """Return the layout of a stream from its table. Raises `UsageError` for a missing, unknown or contradictory entry."""
+    stream_place = f"{place}, [streams.{plain(name)}]"
+    values = dict(_expect_table(value, stream_place, ""))
     if not name.isidentifier():
-        raise UsageError(f"{place}: a stream's name is letters, digits and underscores, as it becomes a file's name.")
+        raise UsageError(
+            f"{stream_place}: a stream's name is letters, digits and underscores, as it becomes a file's name."
+        )
     if container is not None:
         values.setdefault("format", container)
-    _expect_required(values, place, container)
+    _expect_required(values, stream_place, container)
     if "time" in values:
-        values["time"] = _parse_time(values["time"], place)
+        values["time"] = _parse_time(values["time"], stream_place)
     columns = values.get("columns", [])
     if not isinstance(columns, list):
-        raise UsageError(f"{place}: columns is {excerpt(columns)}; it must be a list of tables.")
+        raise UsageError(f"{stream_place}: columns is {excerpt(columns)}; it must be a list of tables.")
     values["columns"] = tuple(
-        _parse_column(column, f"{place}, columns {number}") for number, column in enumerate(columns, 1)
+        _parse_column(column, f"{stream_place}, columns {number}") for number, column in enumerate(columns, 1)
     )
     if "long" in values:
         values["long"] = fields.build_dataclass(
-            LongColumns, _expect_table(values["long"], place, "long"), f"{place}, long", "entry"
+            LongColumns, _expect_table(values["long"], stream_place, "long"), f"{stream_place}, long", "entry"
         )
     if isinstance(values.get("header"), list):
         values["names"], values["header"] = values["header"], False
     if "missing" in values and isinstance(values["missing"], list):
         values["missing"] = tuple(values["missing"])
-    stream: StreamLayout = fields.build_dataclass(StreamLayout, {"name": name, **values}, place, "entry")
+    stream: StreamLayout = fields.build_dataclass(StreamLayout, {"name": name, **values}, stream_place, "entry")
     if len(stream.separator) > 1:
-        raise UsageError(f"{place}: separator is {excerpt(stream.separator)}; it must be one character.")
+        raise UsageError(f"{stream_place}: separator is {excerpt(stream.separator)}; it must be one character.")
     if stream.separator and stream.separator == stream.decimal:
-        raise UsageError(f"{place}: separator and decimal are both {stream.decimal!r}; a number could not be read.")
-    _expect_encoding(stream, place)
+        raise UsageError(
+            f"{stream_place}: separator and decimal are both {stream.decimal!r}; a number could not be read."
+        )
+    _expect_encoding(stream, stream_place)
     absent = set(pattern.placeholders(stream.time.file)) - set(pattern.placeholders(stream.files))
     if absent:
-        raise UsageError(f"{place}: time.file names {{{min(absent)}}}, which files does not have.")
+        raise UsageError(f"{stream_place}: time.file names {{{min(absent)}}}, which files does not have.")
     return stream
 
 
@@ -363,7 +366,10 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
 
 
 def _expect_required(values: Values, place: str, container: Format | None) -> None:
-    """Raise `UsageError` if a required entry is missing; containers require fewer, because they declare more."""
+    """Raise `UsageError` if a required entry is missing or one does not fit the format.
+
+    Containers require fewer entries, because they declare more.
+    """
     if values.get("format") in KINDS:
         if not values.get("source"):
             raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
@@ -400,7 +406,7 @@ def camera_format(kind: object, files: object) -> str:
     ('video', 'images', '')
     """
     if kind is None and isinstance(files, str):
-        kind = "video" if extension(Path(files)) in DEMUXERS else None
+        return "video" if extension(Path(files)) in DEMUXERS else ""
     return str(kind) if kind in CAMERA else ""
 
 
@@ -437,6 +443,10 @@ def _expect_camera(values: Values, place: str, camera: str) -> None:
 
 
 def _parse_time(table: Any, stream_place: str) -> Time:
+    """Return the time of a stream.
+
+    Raises `UsageError` unless it has timestamps or a rate, and for entries that do not fit.
+    """
     place = f"{stream_place}, time"
     time: Time = fields.build_dataclass(Time, _expect_table(table, stream_place, "time"), place, "entry")
     if bool(time.column or time.file) == (time.rate_hz is not None):
@@ -451,12 +461,13 @@ def _parse_time(table: Any, stream_place: str) -> Time:
 
 
 def _parse_column(value: Any, place: str) -> ColumnRule:
+    """Return a column rule. Raises `UsageError` for an invalid name pattern, and for axes or a scale that do not fit."""
     values = dict(_expect_table(value, place, ""))
     if "about" in values:
         values["about"] = tuple(sorted(_expect_table(values["about"], place, "about").items()))
     column: ColumnRule = fields.build_dataclass(ColumnRule, values, place, "entry")
-    places = ("taxel", "axis") if column.shape else ()
-    pattern.fill_pattern(column.name, dict.fromkeys((*pattern.placeholders(column.match), *places), "x"))
+    placeholder_names = ("taxel", "axis") if column.shape else ()
+    pattern.fill_pattern(column.name, dict.fromkeys((*pattern.placeholders(column.match), *placeholder_names), "x"))
     if column.axes and (not column.shape or len(column.axes) not in (column.shape[-1], column.shape[0])):
         raise UsageError(
             f"{place}: axes has {len(column.axes)} names, and shape is {list(column.shape)}. Its last dimension needs one "
@@ -468,6 +479,7 @@ def _parse_column(value: Any, place: str) -> ColumnRule:
 
 
 def _parse_labels(value: Any, place: str) -> LabelSource:
+    """Return a source of labels. Raises `UsageError` if it is one table for all recordings without a key column."""
     values = dict(_expect_table(value, place, ""))
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
@@ -481,6 +493,7 @@ def _parse_labels(value: Any, place: str) -> LabelSource:
 
 
 def _parse_attributes(table: Any, place: str) -> Mapping[str, str | int | float | bool]:
+    """Return the attributes of all recordings. Raises `UsageError` if one is not plain."""
     values = _expect_table(table, place, "attributes")
     for key, value in values.items():
         if not isinstance(value, str | int | float | bool):

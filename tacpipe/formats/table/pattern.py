@@ -71,12 +71,12 @@ def match(pattern: str, text: str) -> dict[str, str] | None:
 
 
 def _max_steps(pattern: str, text: str) -> int:
-    """Return the maximum number of ways to divide a text among the placeholders of a pattern."""
+    """Return the maximum number of steps for matching a text with a pattern, from the ways to divide it."""
     parts = _PART.findall(pattern)
-    wild = sum(not literal for *_, literal, _ in parts)
-    between = [literal for *_, literal, _ in parts[1:-1] if literal]
-    cuts: int = max(map(text.count, between), default=1) if len(between) >= wild - 1 else len(text)
-    return len(text) * int(cuts ** max(wild - 1, 0))
+    wildcards = sum(not literal for *_, literal, _ in parts)
+    literals = [literal for *_, literal, _ in parts[1:-1] if literal]
+    places_per_cut: int = max(map(text.count, literals), default=1) if len(literals) >= wildcards - 1 else len(text)
+    return len(text) * int(places_per_cut ** max(wildcards - 1, 0))
 
 
 def placeholders(pattern: str) -> tuple[str, ...]:
@@ -139,23 +139,27 @@ def _tokens(name: str) -> list[_Token]:
 def _level_pattern(
     names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool
 ) -> str:
-    """Return the pattern of one level of paths; adds its placeholders with their texts to ``in_use``."""
+    """Return the pattern of one level of paths, whose ``names`` are given as tokens.
+
+    Adds its placeholders with their texts to ``in_use``; a placeholder with the same texts is used again. ``is_last``:
+    the last text that differs is the trial.
+    """
     parts = _common_parts(names)
     differing = [index for index, (_, texts) in enumerate(parts) if len(set(texts)) > 1]
     pattern = ""
     for index, (kind, texts) in enumerate(parts):
-        counted = _COUNTER.search(pattern)
+        counter = _COUNTER.search(pattern)
         word = re.search(r"([A-Za-z]{2,})[-_ #.]*$", pattern)
         if kind not in ("date", "number", "text"):
             pattern += kind
             continue
-        if kind == "number" and index not in differing and not counted:
+        if kind == "number" and index not in differing and not counter:
             pattern += texts[0]
             continue
         if kind == "date":
             name = "date"
-        elif kind == "number" and counted:
-            name = counted[1].lower()
+        elif kind == "number" and counter:
+            name = counter[1].lower()
         elif is_last and index == differing[-1]:
             name = TRIAL
         else:
@@ -165,31 +169,35 @@ def _level_pattern(
             for placeholder, texts_in_use in in_use.items()
             if texts_in_use == texts and (placeholder == name or len(set(texts)) > 1)
         ]
-        unique = (f"{name}{number}" if number > 1 else name for number in itertools.count(1))
-        name = same[0] if same else next(candidate for candidate in unique if candidate not in in_use)
+        candidates = (f"{name}{number}" if number > 1 else name for number in itertools.count(1))
+        name = same[0] if same else next(candidate for candidate in candidates if candidate not in in_use)
         in_use[name] = texts
         pattern += f"{{{name}}}"
     return pattern
 
 
 def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the common parts of names with their texts; everything that differs is one part, ``text``."""
+    """Return the parts that all names have, each with its text per name; everything that differs is one part, ``text``."""
     kinds = [[kind for kind, _ in tokens] for tokens in names]
-    before = _count_common_start(kinds)
-    after = 0
+    start_count = _count_common_start(kinds)
+    end_count = 0
     if any(tokens != kinds[0] for tokens in kinds):
-        before = _count_before_slots(kinds[0], before)
-        after = _count_before_slots(kinds[0][::-1], _count_common_start([tokens[before:][::-1] for tokens in kinds]))
-        while any(len(tokens) == before + after for tokens in kinds):  # a placeholder has at least one character
-            if before:
-                before = _count_before_slots(kinds[0], before - 1)
+        start_count = _count_before_slots(kinds[0], start_count)
+        end_count = _count_before_slots(
+            kinds[0][::-1], _count_common_start([tokens[start_count:][::-1] for tokens in kinds])
+        )
+        while any(
+            len(tokens) == start_count + end_count for tokens in kinds
+        ):  # a placeholder has at least one character
+            if start_count:
+                start_count = _count_before_slots(kinds[0], start_count - 1)
             else:
-                after = _count_before_slots(kinds[0][::-1], after - 1)
-    parts = [(kinds[0][index], tuple(tokens[index][1] for tokens in names)) for index in range(before)]
-    if any(len(tokens) > before + after for tokens in names):
-        middles = tuple("".join(text for _, text in tokens[before : len(tokens) - after]) for tokens in names)
+                end_count = _count_before_slots(kinds[0][::-1], end_count - 1)
+    parts = [(kinds[0][index], tuple(tokens[index][1] for tokens in names)) for index in range(start_count)]
+    if any(len(tokens) > start_count + end_count for tokens in names):
+        middles = tuple("".join(text for _, text in tokens[start_count : len(tokens) - end_count]) for tokens in names)
         parts.append(("text", middles))
-    parts += [(kinds[0][-index], tuple(tokens[-index][1] for tokens in names)) for index in range(after, 0, -1)]
+    parts += [(kinds[0][-index], tuple(tokens[-index][1] for tokens in names)) for index in range(end_count, 0, -1)]
     return parts
 
 

@@ -57,23 +57,24 @@ class Steps:
         self._longest_ns = max(self._longest_ns, int(steps_ns.max(initial=0)))
         self._waiting.append(steps_ns)
         if sum(map(len, self._waiting)) > MAX_DIFFERENT:
-            self._count()
+            self._merge()
 
-    def _count(self) -> None:
+    def _merge(self) -> None:
+        """Merge the waiting steps into the counts, ignoring low bits if there are too many distinct steps."""
         steps_ns = np.concatenate([self._steps, *self._waiting])
         counts = np.concatenate([self._counts, *(np.ones(len(steps_ns), np.int64) for steps_ns in self._waiting)])
         self._waiting = []
         while True:
-            self._steps, at = np.unique(steps_ns >> self._coarse_bits << self._coarse_bits, return_inverse=True)
+            self._steps, step_index = np.unique(steps_ns >> self._coarse_bits << self._coarse_bits, return_inverse=True)
             if len(self._steps) <= MAX_DIFFERENT:
                 break
             self._coarse_bits += 1
         self._counts = np.zeros(len(self._steps), np.int64)
-        np.add.at(self._counts, at, counts)
+        np.add.at(self._counts, step_index, counts)
 
     def median_ns(self) -> float:
-        """Return the median, or 0 if there is no step."""
-        self._count()
+        """Return the median step in ns, or 0 if there is no step."""
+        self._merge()
         total = int(self._counts.sum())
         if not total:
             return 0.0
@@ -83,7 +84,7 @@ class Steps:
 
     def longer(self, than_ns: float) -> int:
         """Return the number of steps longer than ``than_ns``."""
-        self._count()
+        self._merge()
         return int(self._counts[self._steps > than_ns].sum())
 
     def longest_ns(self) -> int:
@@ -117,42 +118,44 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
     >>> found.rows, found.rate_hz, found.gaps, found.columns["a"][3:]
     (4, 100.0, 1, (1, 5))
     """
-    first: pa.Table = rows.schema.empty_table()
-    ends: dict[str, list[Any]] = {}
-    stamps: list[int] = []  # timestamps of the first and the latest row
+    first_rows: pa.Table = rows.schema.empty_table()
+    extremes_by_column: dict[str, list[Any]] = {}
+    first_and_last_ns: list[int] = []  # timestamps of the first and the latest row
     count, steps = 0, Steps()
     for batch in rows.to_batches() if isinstance(rows, pa.Table) else rows:
         if not batch.num_rows:
             continue
         count += batch.num_rows
-        if first.num_rows < SHOWN_ROWS:
-            first = pa.concat_tables([first, pa.Table.from_batches([batch.slice(0, SHOWN_ROWS)])]).slice(0, SHOWN_ROWS)
+        if first_rows.num_rows < SHOWN_ROWS:
+            first_rows = pa.concat_tables([first_rows, pa.Table.from_batches([batch.slice(0, SHOWN_ROWS)])]).slice(
+                0, SHOWN_ROWS
+            )
         t_ns = batch.column(TIME).to_numpy()
-        steps.add(np.diff(t_ns, prepend=stamps[-1]) if stamps else np.diff(t_ns))
-        stamps = [stamps[0] if stamps else int(t_ns[0]), int(t_ns[-1])]
+        steps.add(np.diff(t_ns, prepend=first_and_last_ns[-1]) if first_and_last_ns else np.diff(t_ns))
+        first_and_last_ns = [first_and_last_ns[0] if first_and_last_ns else int(t_ns[0]), int(t_ns[-1])]
         for field in _measured_fields(rows.schema):
             column = batch.column(field.name)
             limits = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
-            extremes = [
-                *ends.get(field.name, []),
+            values = [
+                *extremes_by_column.get(field.name, []),
                 *(value for value in limits.values() if value is not None and value == value),
             ]
-            ends[field.name] = [min(extremes), max(extremes)] if extremes else []
-    usual_ns = steps.median_ns()
+            extremes_by_column[field.name] = [min(values), max(values)] if values else []
+    median_step_ns = steps.median_ns()
     columns = {}
     for field in _measured_fields(rows.schema):
-        about = field_metadata(field)
+        metadata = field_metadata(field)
         kind = TYPE_NAMES.get(field.type, str(field.type))
-        lowest, highest = ends.get(field.name) or (math.nan, math.nan)
-        columns[field.name] = about.get("quantity", ""), about.get("unit", ""), kind, lowest, highest
+        lowest, highest = extremes_by_column.get(field.name) or (math.nan, math.nan)
+        columns[field.name] = metadata.get("quantity", ""), metadata.get("unit", ""), kind, lowest, highest
     return StreamSummary(
         count,
-        stamps[0] if stamps else 0,
-        1e9 / usual_ns if usual_ns else 0.0,
-        steps.longer(GAP * usual_ns),
+        first_and_last_ns[0] if first_and_last_ns else 0,
+        1e9 / median_step_ns if median_step_ns else 0.0,
+        steps.longer(GAP * median_step_ns),
         steps.longest_ns() / 1e9,
         columns,
-        first,
+        first_rows,
     )
 
 
@@ -197,6 +200,7 @@ def _describe_recording(layout: Layout, source: RecordingFiles, kind: str | None
 
 
 def _describe_labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
+    """Return a line per label with its values."""
     names = sorted({name for values in labelled.values() for name in values})
     lines = []
     for name in names:
@@ -208,6 +212,7 @@ def _describe_labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[st
 
 
 def _describe_stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Path) -> list[str]:
+    """Return a line about a stream, one per group of columns with the same meaning, and the first rows."""
     summary = summarize_stream(rows)
     start = np.datetime64(summary.first_ns, "ns")
     lines = [
@@ -220,10 +225,11 @@ def _describe_stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Pat
     for (quantity, unit, kind), columns in by_kind.items():
         lowest = min(summary.columns[column][3] for column in columns)
         highest = max(summary.columns[column][4] for column in columns)
-        about = f"{quantity or 'no quantity'}, {unit or 'no unit'}, {kind}"
-        measure = " bytes" if kind == "binary" else ""
+        meaning = f"{quantity or 'no quantity'}, {unit or 'no unit'}, {kind}"
+        size_unit = " bytes" if kind == "binary" else ""
         lines.append(
-            f"    {len(columns)} x {about}, from {lowest:.6g} to {highest:.6g}{measure}: {listed(columns, SHOWN_COLUMNS)}"
+            f"    {len(columns)} x {meaning}, from {lowest:.6g} to {highest:.6g}{size_unit}: "
+            f"{listed(columns, SHOWN_COLUMNS)}"
         )
     first_rows = summary.first.select(summary.first.column_names[: SHOWN_COLUMNS + 1]).to_pylist()
     return lines + ["    " + "  ".join(map(_cell_text, row.values())) for row in first_rows]
@@ -244,7 +250,7 @@ def declared_layout(kind: str, source: Path) -> str:
     paths = find_containers(kind, source)
     if not paths:
         raise no_container_error(kind, source)
-    passed_over: list[str] = []
+    remarks: list[str] = []
     for path in paths:
         try:
             file = open_container(kind, path)
@@ -252,16 +258,16 @@ def declared_layout(kind: str, source: Path) -> str:
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
-            passed_over.append(plain(str(error), 400))
+            remarks.append(plain(str(error), 400))
             continue
         if contents.streams:
             unread_files = describe_unread(
                 source, paths, lambda path_within: _why_unread(kind, source / path_within, paths)
             )
-            return _layout_text(contents, f"tacpipe ingest {kind}", path, [*passed_over, *unread_files])
+            return _layout_text(contents, f"tacpipe ingest {kind}", path, [*remarks, *unread_files])
         reasons = [f"{plain(name)}: {problem}" for name, problem in contents.skipped.items()]
-        passed_over.append(f"{path} holds no stream that can be read. {'; '.join(reasons)}".rstrip())
-    raise TacpipeError(" ".join([f"No recording of ingest {kind} at {source} holds a stream.", *passed_over[:3]]))
+        remarks.append(f"{path} holds no stream that can be read. {'; '.join(reasons)}".rstrip())
+    raise TacpipeError(" ".join([f"No recording of ingest {kind} at {source} holds a stream.", *remarks[:3]]))
 
 
 def _why_unread(kind: str, path: Path, containers: Sequence[Path]) -> str:
@@ -286,6 +292,7 @@ def _layout_text(contents: EpisodeContents, command: str, path: Path, remarks: S
 
 
 def _stream_text(stream: SourceStream) -> str:
+    """Return the text of a ``[streams.NAME]`` entry with what a container declares."""
     rows = "" if stream.rows is None else f"  # {stream.rows} rows"
     lines = [f"[streams.{stream.name}]", f"source = {_quote(stream.source)}{rows}"]
     declared = f"# time = {_time_text(stream.time)}, if nothing else is written here"
@@ -300,9 +307,11 @@ def _is_time(field: pa.Field) -> bool:
 
 
 def _time_text(time: Time) -> str:
+    """Return a time as an entry of a layout. A unit is always written."""
     entries = [("column", time.column), ("unit", time.unit if time.column else "s"), ("origin", time.origin)]
     entries += [("zone", time.zone), ("start", time.start)]
-    default = Time(unit="s" if not time.column else "iso8601" if time.unit == "s" else "s")  # a unit is always written
+    # a default unit that differs from the time's, if that has a column
+    default = Time(unit="iso8601" if time.column and time.unit == "s" else "s")
     entries_text = [f"{key} = {_quote(value)}" for key, value in entries if value != getattr(default, key)]
     entries_text += [] if time.rate_hz is None else [f"rate_hz = {time.rate_hz:g}"]
     return "{ " + ", ".join(entries_text) + " }"
@@ -310,24 +319,19 @@ def _time_text(time: Time) -> str:
 
 def _column_rules(fields: Sequence[pa.Field]) -> list[str]:
     """Return an entry for each set of columns with equal declarations whose names differ only in numbers."""
-    fields = [field for field in fields if not set("{}*") & set(field.name)]  # such names keep their declaration
-    alike: dict[tuple[str, str, str, str], list[str]] = {}
-    for field in fields:
-        about = field_metadata(field)
-        declared = (about.get("quantity", ""), about.get("unit", ""), TYPE_NAMES.get(field.type, ""))
-        alike.setdefault((re.sub(r"\d+", "*", field.name), *declared), []).append(field.name)
-    patterns = {
-        declared_rule: names
-        for declared_rule, names in alike.items()
-        if len(names) > 1 and _matches_only(declared_rule[0], fields, names)
-    }
-    exact = [
-        ((name, *declared_rule[1:]), [name])
-        for declared_rule, names in alike.items()
-        if declared_rule not in patterns
-        for name in names
-    ]
-    return [_rule_text(*declared_rule) for declared_rule, _ in [*exact, *patterns.items()]]
+    plain_fields = [field for field in fields if not set("{}*") & set(field.name)]  # others keep their declaration
+    names_by_rule: dict[tuple[str, str, str, str], list[str]] = {}
+    for field in plain_fields:
+        metadata = field_metadata(field)
+        declared = (metadata.get("quantity", ""), metadata.get("unit", ""), TYPE_NAMES.get(field.type, ""))
+        names_by_rule.setdefault((re.sub(r"\d+", "*", field.name), *declared), []).append(field.name)
+    patterns, exact = [], []
+    for (match, *declaration), names in names_by_rule.items():
+        if len(names) > 1 and _matches_only(match, plain_fields, names):
+            patterns.append(_rule_text(match, *declaration))
+        else:
+            exact += [_rule_text(name, *declaration) for name in names]
+    return [*exact, *patterns]
 
 
 def _matches_only(text: str, fields: Sequence[pa.Field], names: Sequence[str]) -> bool:
@@ -335,6 +339,7 @@ def _matches_only(text: str, fields: Sequence[pa.Field], names: Sequence[str]) -
 
 
 def _rule_text(match: str, quantity: str, unit: str, kind: str) -> str:
+    """Return a column rule as text, with a comment on what the file does not declare."""
     unknown = kind not in ("text", "binary") and [
         name for name, value in (("quantity", quantity), ("unit", unit)) if not value
     ]

@@ -51,20 +51,29 @@ class LongTable:
 
         Raises `TacpipeError` for two values of a channel at one time, and the errors of `columns.convert_column`.
         """
-        moments = 0
+        moment_count = 0
         for table in in_order(self.pieces, self.spill.read, MOMENT):
-            t_ns, at = np.unique(table.column(MOMENT).to_numpy(), return_inverse=True)
+            t_ns, moment_index = np.unique(table.column(MOMENT).to_numpy(), return_inverse=True)
             codes, values = table.column(CHANNEL).to_numpy(), table.column(VALUE).to_numpy()
-            self._expect_single(at * len(self.channels) + codes, codes, table)
+            self._expect_single(moment_index * len(self.channels) + codes, codes, table)
             step = max(1, GRID_VALUES // len(self.channels))
             for start in range(0, len(t_ns), step):
-                first, last = np.searchsorted(at, [start, start + step])
+                first, last = np.searchsorted(moment_index, [start, start + step])
                 grid = np.full((len(self.channels), len(t_ns[start : start + step])), np.nan)  # (channel, time)
-                grid[codes[first:last], at[first:last] - start] = values[first:last]
-                yield t_ns[start : start + step], [self._column(grid, channel, moments + start) for channel in channels]
-            moments += len(t_ns)
+                grid[codes[first:last], moment_index[first:last] - start] = values[first:last]
+                yield (
+                    t_ns[start : start + step],
+                    [self._column(grid, channel, moment_count + start) for channel in channels],
+                )
+            moment_count += len(t_ns)
 
     def _column(self, grid: Floats, channel: ChosenColumn, before: int) -> pa.Array:
+        """Return the column of a channel in a grid (channel, time).
+
+        Raises `TacpipeError` for a value that does not fit it.
+
+        ``before`` is the number of moments before the grid.
+        """
         values = pa.chunked_array([pa.array(grid[self.channels.index(channel.name)])])
         try:
             return columns.convert_column(values, channel, nan_allowed=True)
@@ -73,13 +82,16 @@ class LongTable:
             raise TacpipeError(f"{place} {error}.") from error
 
     def _expect_single(self, cells: AnyArray, codes: AnyArray, table: pa.Table) -> None:
-        """Raise `TacpipeError` if two rows have the same time and channel, given as ``cells``."""
+        """Raise `TacpipeError` if two rows have the same time and channel, which are encoded in ``cells`` (row,).
+
+        ``codes`` are the channels of the rows.
+        """
         order = np.argsort(cells, kind="stable")
-        doubled = np.flatnonzero(np.diff(cells[order]) == 0)
-        if not len(doubled):
+        repeated = np.flatnonzero(np.diff(cells[order]) == 0)
+        if not len(repeated):
             return
         row_of = table.column(ROW_INDEX).to_numpy()
-        second = order[doubled + 1]
+        second = order[repeated + 1]
         row = int(second[row_of[second].argmin()])
         raise TacpipeError(
             f"{self.file.path} has two values of {plain(self.channels[codes[row]])} at one moment, the second in "
@@ -88,7 +100,10 @@ class LongTable:
 
 
 def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, shared: Shared | None) -> LongTable:
-    """Return the rows of a table in long form. Raises the errors of `rows.row_blocks`, and one for too many channels."""
+    """Return the rows of a table in long form, moved to a spill file and sorted by time in runs.
+
+    Raises the errors of `rows.row_blocks`, and `TacpipeError` for too many channels.
+    """
     assert stream.long is not None
     if not stream.time.column:
         raise UsageError(
@@ -120,7 +135,10 @@ def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, 
 
 
 def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: StreamLayout, place: Place) -> AnyArray:
-    """Return the channel index of each row (row,); adds new channels to ``codes``."""
+    """Return the channel index of each row (row,), and add new channels to ``codes``.
+
+    Raises `TacpipeError` if a row names no channel.
+    """
     encoded = column.cast(pa.string()).fill_null("").combine_chunks().dictionary_encode()
     names = encoded.dictionary.to_pylist()
     if "" in names:
@@ -169,8 +187,8 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     If the layout's ``stream`` sets neither time nor columns, the container's declarations apply. Metadata of the time
     column are copied to ``t_ns``. A column of images becomes packets. Raises the errors of `stream_batches`.
     """
-    stream = stream if stream.time.is_declared else replace(stream, time=source.time)
-    if not stream.time.is_declared:
+    timed_stream = stream if stream.time.is_declared else replace(stream, time=source.time)
+    if not timed_stream.time.is_declared:
         raise TacpipeError(
             f"{path} does not state when the rows of {plain(source.source)} were measured. Give time in "
             f"[streams.{stream.name}]: a column, or rate_hz."
@@ -179,15 +197,18 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     for field in source.schema:
         if field.type not in columns.TYPES.values():
             raise TacpipeError(f"{path}: column {plain(field.name)} of {plain(source.source)} holds {field.type}.")
-    stamped = declared.get(stream.time.column)
-    is_other_clock = stamped is not None and stream.time.column != source.time.column
-    is_number = stamped is not None and (pa.types.is_integer(stamped.type) or pa.types.is_floating(stamped.type))
-    file = ContainedRows(path, source, stream.time.column if is_other_clock and is_number else "")
-    about = schema.field_metadata(stamped) if stamped else {}
-    time_metadata = {key: value for key, value in about.items() if key not in ("unit", "quantity")}
-    reader = _batches(file, stream, None, declared, time_metadata)
+    clock = timed_stream.time.column
+    clock_field = declared.get(clock)
+    is_other_clock = clock_field is not None and clock != source.time.column
+    is_number = clock_field is not None and (
+        pa.types.is_integer(clock_field.type) or pa.types.is_floating(clock_field.type)
+    )
+    file = ContainedRows(path, source, clock if is_other_clock and is_number else "")
+    metadata = schema.field_metadata(clock_field) if clock_field else {}
+    time_metadata = {key: value for key, value in metadata.items() if key not in ("unit", "quantity")}
+    reader = _batches(file, timed_stream, None, declared, time_metadata)
     table_or_reader = reader.read_all() if isinstance(source.content, pa.Table) else reader
-    return frames_from_images(table_or_reader, f"{path}, {plain(source.source)}", stream.time.rate_hz)
+    return frames_from_images(table_or_reader, f"{path}, {plain(source.source)}", timed_stream.time.rate_hz)
 
 
 def _batches(
@@ -199,12 +220,17 @@ def _batches(
     shared: Shared | None = None,
     stamps_ns: Times | None = None,
 ) -> pa.RecordBatchReader:
+    """Return the rows of a stream as batches with ``t_ns``; the timestamps ``stamps_ns`` (row,) may come from another file.
+
+    ``declared`` are the fields that a container describes, and ``about_time`` is metadata for ``t_ns``. Raises
+    `TacpipeError` for a missing column, and the errors of `stream_batches`.
+    """
     path, names = file.path, file.names()
     clock = "" if stream.time.file else stream.time.column
-    reserved = [name for name in (clock, stream.recording) if name]
+    reserved_names = [name for name in (clock, stream.recording) if name]
     if stream.long is not None:
-        reserved += [stream.long.channel, stream.long.value]
-    missing = [name for name in reserved if name not in names]
+        reserved_names += [stream.long.channel, stream.long.value]
+    missing = [name for name in reserved_names if name not in names]
     if missing:
         raise TacpipeError(
             f"{path} has no column {listed(missing, 3)}, which [streams.{stream.name}] names; it has {listed(names, 6)}."
@@ -218,24 +244,25 @@ def _batches(
         blocks = long.blocks(chosen_columns)
     else:
         chosen_columns = columns.choose_columns(
-            stream, [name for name in names if name not in reserved], path, declared
+            stream, [name for name in names if name not in reserved_names], path, declared
         )
         types = {**rows.reserved_types(file, stream), **{column.name: column.read_as for column in chosen_columns}}
-        as_is = bool(declared)  # NaN and infinity in a container are values
+        allows_non_finite = bool(declared)  # NaN and infinity in a container are values
         blocks = (
-            _convert_block(stream, block, chosen_columns, place, as_is)
+            _convert_block(stream, block, chosen_columns, place, allows_non_finite)
             for block, _, place in rows.row_blocks(file, stream, types, recording, shared)
         )
     if stamps_ns is not None:
         blocks = _add_stamps_of_file(blocks, stamps_ns, file, stream)
     output_schema = pa.schema([_time_field(stream, about_time), *(column.field for column in chosen_columns)])
-    stamped = _check_stamps(blocks, file, stream, recording, start_ns)
+    checked_blocks = _check_stamps(blocks, file, stream, recording, start_ns)
     return pa.RecordBatchReader.from_batches(
-        output_schema, (batch for columns_of in stamped for batch in pa.table(columns_of, output_schema).to_batches())
+        output_schema,
+        (batch for columns_of in checked_blocks for batch in pa.table(columns_of, output_schema).to_batches()),
     )
 
 
-def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
+def _time_field(stream: StreamLayout, metadata: Mapping[str, str]) -> pa.Field:
     """Return the field of ``t_ns`` with further metadata."""
     if stream.time.rate_hz is not None:
         field = schema.time_field("from rate")
@@ -243,26 +270,29 @@ def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
         field = schema.time_field("from the start of the recording")
     else:
         field = schema.time_field()
-    return field.with_metadata(schema.field_metadata(field) | dict(about))
+    return field.with_metadata(schema.field_metadata(field) | dict(metadata))
 
 
 def _check_stamps(
     blocks: Iterable[Block], file: RowFile, stream: StreamLayout, recording: str | None, start_ns: int
 ) -> Iterator[list[pa.Array]]:
-    """Yield timestamps and columns of blocks. Raises `TacpipeError` if timestamps decrease or there are no rows."""
+    """Yield timestamps and columns of blocks, with ``start_ns`` added to the timestamps.
+
+    Rows without timestamps get them from the rate, and times of day increase past midnight. Raises `TacpipeError` if
+    timestamps decrease or there are no rows.
+    """
     row_count, last_ns = 0, None
-    of_day = bool(stream.time.format) and not stamps.has_date(stream.time.format)
-    for t_ns, arrays in blocks:
+    are_times_of_day = bool(stream.time.format) and not stamps.has_date(stream.time.format)
+    for block_ns, arrays in blocks:
         count = len(arrays[0])
         if not count:
             continue
-        if t_ns is not None and of_day:
-            t_ns = _add_days_past_midnight(t_ns, last_ns)
-        if t_ns is None:
+        if block_ns is None:
             assert stream.time.rate_hz is not None
             t_ns = resampling.uniform_offsets(row_count, count, stream.time.rate_hz)
         else:
-            _expect_rising(t_ns, last_ns, row_count, file, recording)
+            t_ns = _add_days_past_midnight(block_ns, last_ns) if are_times_of_day else block_ns
+            _expect_ascending(t_ns, last_ns, row_count, file, recording)
             last_ns = int(t_ns[-1])
         row_count += count
         yield [pa.array(t_ns + start_ns if start_ns else t_ns), *arrays]
@@ -278,10 +308,9 @@ def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
     array([86399000000000, 86401000000000])
     """
     day_ns = stamps.DAY_NS
-    above_ns = int(t_ns[0]) if last_ns is None else last_ns
-    first_ns = t_ns[0] + max(0, round((above_ns - int(t_ns[0])) / day_ns)) * day_ns
-    t_ns = t_ns - t_ns[0] + first_ns
-    return t_ns + np.cumsum(np.diff(t_ns, prepend=t_ns[0]) < -day_ns // 2) * day_ns
+    previous_ns = int(t_ns[0]) if last_ns is None else last_ns
+    days = max(0, round((previous_ns - int(t_ns[0])) / day_ns))  # days before the first time
+    return t_ns + (days + np.cumsum(np.diff(t_ns, prepend=t_ns[0]) < -day_ns // 2)) * day_ns
 
 
 def _add_stamps_of_file(
@@ -303,7 +332,7 @@ def _unequal_lengths(file: RowFile, stream: StreamLayout, rows_there: str, stamp
     return f"{file.path} has {rows_there}, and {plain(stream.time.file)} has {len(stamps_ns)} stamps. Copy both again."
 
 
-def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
+def _expect_ascending(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
     """Raise `TacpipeError` if timestamps decrease; ``last_ns`` is the previous one, after ``before`` rows."""
     steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
     backwards = np.flatnonzero(steps_ns < 0)
@@ -322,7 +351,10 @@ def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile,
 def _convert_block(
     stream: StreamLayout, block: pa.Table, chosen_columns: list[ChosenColumn], place: Place, as_is: bool
 ) -> Block:
-    """Return the timestamps of a block, if it has them, and its columns in their declared types."""
+    """Return the timestamps of a block, or None without a time column, and its columns in their declared types.
+
+    ``as_is``: NaN and infinity are values. Raises `TacpipeError` for values that do not fit their type.
+    """
     clock = "" if stream.time.file else stream.time.column
     t_ns = rows.stamps_of_column(block.column(clock), stream, place) if clock else None
     arrays = []
@@ -348,7 +380,8 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
     images = image_paths(path) if stream.camera == "images" else []
     frames = None if images else video_files.scan(path)
     count = len(images) if frames is None else len(frames)
-    origin, numbers = None, None if frames is None else frames.counter()
+    origin = None
+    numbers = None if frames is None else frames.counter()
     if stamps_path is not None:
         t_ns = rows.stamps_of_file(stamps_path, stream)
         if len(t_ns) != count:
@@ -402,13 +435,8 @@ def image_paths(folder: Path) -> list[Path]:
 
     Raises `TacpipeError` if there is none.
     """
-    paths = [
-        Path(directory, name)
-        for directory, _, names in file_system.walk(folder)
-        if Path(directory) == folder
-        for name in names
-    ]
-    images = [path for path in paths if path.suffix.lower() in video_files.IMAGE_CODECS]
+    names = next((names for directory, _, names in file_system.walk(folder) if Path(directory) == folder), ())
+    images = [path for path in (folder / name for name in names) if path.suffix.lower() in video_files.IMAGE_CODECS]
     if not images:
         raise TacpipeError(f"{folder} holds no image. Give a folder with JPEG, PNG or WebP files.")
     return sorted(
@@ -426,7 +454,10 @@ def parts_of(path: Path) -> list[str]:
 
 
 def _stamps_of_names(images: Sequence[Path], stream: StreamLayout) -> Times:
-    """Return the timestamps in image names, which are the last number of each, in ns (image,)."""
+    """Return the timestamps in image names, which are the last number of each, in ns (image,).
+
+    Raises `TacpipeError` if a name has no number.
+    """
     numbers = [last_number(path) for path in images]
     nameless = [path for path, number in zip(images, numbers, strict=True) if number is None]
     if nameless:
@@ -446,6 +477,10 @@ def last_number(path: Path) -> str | None:
 
 
 def _start_ns(stream: StreamLayout) -> int:
+    """Return the start of the recording in ns since 1970, or 0 if the layout has none.
+
+    Raises `UsageError` if it is not ISO 8601.
+    """
     if not stream.time.start:
         return 0
     try:
@@ -454,6 +489,5 @@ def _start_ns(stream: StreamLayout) -> int:
         raise UsageError(
             f"[streams.{stream.name}] time.start is {excerpt(stream.time.start)}; it must be ISO 8601."
         ) from error
-    at = at if at.tzinfo else at.replace(tzinfo=UTC)
-    seconds = at.replace(microsecond=0)
-    return int(seconds.timestamp()) * 10**9 + at.microsecond * 1000
+    start = at if at.tzinfo else at.replace(tzinfo=UTC)
+    return int(start.replace(microsecond=0).timestamp()) * 10**9 + start.microsecond * 1000

@@ -60,7 +60,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
         stream.name: _matching_paths(stream, image_folders if stream.camera == "images" else candidates)
         for stream in layout.streams
     }
-    _refuse_idle(layout, matched, candidates, folder)
+    _refuse_unmatched(layout, matched, candidates, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
     stamps: dict[Path, Path] = {}  # timestamp file by file of rows
@@ -72,9 +72,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
                 )
             if stream.time.file:
                 stamps[path] = Path(pattern.fill_pattern(stream.time.file, values))
-            groups.setdefault(tuple(values[placeholder] for placeholder in shared), {}).setdefault(
-                stream.name, []
-            ).append(path)
+            groups.setdefault(tuple(values[name] for name in shared), {}).setdefault(stream.name, []).append(path)
     sources = []
     for key, by_stream in sorted(groups.items()):
         for name, paths in by_stream.items():
@@ -97,8 +95,8 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
             if rows_path in stamps
         }
         sources += _recordings_in_files(layout, files, dict(zip(shared, key, strict=True)))
-    refuse_shared_names((placeholder.name, next(iter(placeholder.files.values()))) for placeholder in sources)
-    return sorted(sources, key=lambda placeholder: placeholder.name)
+    refuse_shared_names((source.name, next(iter(source.files.values()))) for source in sources)
+    return sorted(sources, key=lambda source: source.name)
 
 
 def find_contained(layout: Layout, kind: Format, source: Path) -> list[RecordingFiles]:
@@ -111,23 +109,25 @@ def find_contained(layout: Layout, kind: Format, source: Path) -> list[Recording
     if not paths:
         raise no_container_error(kind, source)
     sources = []
-    for path, stem in container_names(paths, source).items():
-        stem = os.fsencode(stem).decode(errors="replace")
+    for path, container_name in container_names(paths, source).items():
+        stem = os.fsencode(container_name).decode(errors="replace")
         files = {stream.name: path for stream in layout.streams} or {CONTAINER: path}
         episodes, names_are_complete = _episodes(kind, path)
         for episode in episodes:
             values = {FILE: stem, **({} if episode is None else {"recording": episode})}
-            plain_name = stem if episode is None else episode if names_are_complete else f"{stem}-{episode}"
+            plain_name = stem
+            if episode is not None:
+                plain_name = episode if names_are_complete else f"{stem}-{episode}"
             name = valid_name(pattern.fill_pattern(layout.name, values) if layout.name else plain_name)
             if not name:
                 raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
             sources.append(RecordingFiles(name, files, {}, episode))
-    refuse_shared_names((stream.name, next(iter(stream.files.values()))) for stream in sources)
-    return sorted(sources, key=lambda stream: stream.name)
+    refuse_shared_names((recording.name, next(iter(recording.files.values()))) for recording in sources)
+    return sorted(sources, key=lambda recording: recording.name)
 
 
 def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
-    """Return the recordings in a container ([None] for a single one), and whether their names need no file name as prefix.
+    """Return the recordings in a container, [None] for a single one, and whether their names need no prefix.
 
     An unreadable container counts as one recording: reading it later reports the error, and other containers are still
     read.
@@ -155,6 +155,7 @@ def _candidate_paths(layout: Layout, folder: Path) -> list[Path]:
 
 
 def _matching_paths(stream: StreamLayout, candidates: list[Path]) -> list[tuple[Path, Mapping[str, str]]]:
+    """Return the paths that match the pattern of a stream, each with the values of its placeholders."""
     matches: list[tuple[Path, Mapping[str, str]]] = []
     for path in candidates:
         values = pattern.match(stream.files, path.as_posix())
@@ -165,7 +166,8 @@ def _matching_paths(stream: StreamLayout, candidates: list[Path]) -> list[tuple[
     return matches
 
 
-def _refuse_idle(layout: Layout, matched: Mapping[str, Sized], candidates: list[Path], folder: Path) -> None:
+def _refuse_unmatched(layout: Layout, matched: Mapping[str, Sized], candidates: list[Path], folder: Path) -> None:
+    """Raise `UsageError` if no file matches the pattern of a required stream."""
     for stream in layout.streams:
         if not matched[stream.name] and not stream.optional:
             raise UsageError(
@@ -175,7 +177,10 @@ def _refuse_idle(layout: Layout, matched: Mapping[str, Sized], candidates: list[
 
 
 def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[RecordingFiles]:
-    """Return the recording that consists of these files, or the recordings that they contain."""
+    """Return the recording that consists of these files, or the recordings that they contain.
+
+    ``values`` are those of the placeholders. Raises `UsageError` if the files contain different recordings.
+    """
     shared_streams = [
         stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
     ]
@@ -189,9 +194,10 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
     first = next(iter(names_by_stream.values()))
     for stream, names in names_by_stream.items():
         if names != first:
-            odd = sorted(names ^ first)
+            odd_names = sorted(names ^ first)
             raise UsageError(
-                f"{files[stream]} and {files[next(iter(names_by_stream))]} hold different recordings: {listed(odd, 3)} is "
+                f"{files[stream]} and {files[next(iter(names_by_stream))]} hold different recordings: "
+                f"{listed(odd_names, 3)} is "
                 f"in only one of them."
             )
     return [
@@ -203,7 +209,8 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
 def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
     """Return the recordings in a file: values of the column ``recording``, or a container's episodes.
 
-    Returns None for a container with a single recording.
+    Returns None for a container with a single recording. Raises `TacpipeError` if the column is missing or has an empty
+    cell.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -227,6 +234,10 @@ def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
 
 
 def _recording_name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) -> str:
+    """Return the name of a recording, by default from the values of its placeholders or the name of its first file.
+
+    Raises `UsageError` if it is not a valid name.
+    """
     if layout.name:
         text = pattern.fill_pattern(layout.name, values)
     elif values:
@@ -295,14 +306,14 @@ def read_streams(
         inner = {source: problem for source, problem in contents.skipped.items() if source.startswith(prefixes)}
         notes += [*contents.notes, *_skipped_notes(path, inner)]
     tables = {
-        stream.name: _with_rate_noted(tables[stream.name], stream.name, notes)
+        stream.name: _with_rate_note(tables[stream.name], stream.name, notes)
         for stream in streams
         if stream.name in tables
     }
     return RecordedStreams(tables, attributes, notes)
 
 
-def _with_rate_noted(
+def _with_rate_note(
     rows: pa.Table | pa.RecordBatchReader, name: str, notes: list[str]
 ) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a stream. When the first rows are read, an implausible rate is added to ``notes``."""
@@ -311,19 +322,20 @@ def _with_rate_noted(
             _note_rate(rows, name, notes)
         return rows
 
-    def read() -> Iterator[pa.RecordBatch]:
+    def read_batches() -> Iterator[pa.RecordBatch]:
         for number, batch in enumerate(rows):
             if not number:
                 _note_rate(batch, name, notes)
             yield batch
 
-    return pa.RecordBatchReader.from_batches(rows.schema, read())
+    return pa.RecordBatchReader.from_batches(rows.schema, read_batches())
 
 
 def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> None:
-    measured = [field for field in rows.schema if field.name != TIME and not pa.types.is_string(field.type)]
+    """Add a note if the first rows of a stream suggest a rate that few sensors have."""
+    channels = [field for field in rows.schema if field.name != TIME and not pa.types.is_string(field.type)]
     step_ns = float(np.median(np.diff(rows.column(TIME).to_numpy()))) if rows.num_rows >= MIN_ROWS else 0.0
-    if measured and step_ns and not LOWEST_HZ <= 1e9 / step_ns <= HIGHEST_HZ:
+    if channels and step_ns and not LOWEST_HZ <= 1e9 / step_ns <= HIGHEST_HZ:
         notes.append(
             f"The stamps of {name} are {step_ns / 1e9:g} s apart, {1e9 / step_ns:,.6g} Hz, which few sensors have. Check "
             f"the unit of its time."
@@ -339,7 +351,7 @@ def read_container(kind: str, path: Path, episode: str | None) -> RecordedStream
     notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]
     stream_by_name = parts_by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
-        name: _with_rate_noted(
+        name: _with_rate_note(
             read_contained_stream(path, stream, StreamLayout(name, source=stream.source)), name, notes
         )
         for name, stream in stream_by_name.items()

@@ -54,18 +54,18 @@ _LENGTH = 8  # bytes
 
 def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) -> None:
     """Write the rows of ``blocks`` to ``draft``, separated by the value of the column ``recording``."""
-    places: dict[str, list[tuple[int, int]]] = {}
+    block_spans: dict[str, list[tuple[int, int]]] = {}
     schema, start_row = None, 0
     for block in blocks:
         for name, rows in _rows_by_recording(block, recording, start_row):
             schema = rows.schema
             for batch in rows.combine_chunks().to_batches():
                 content = memoryview(batch.serialize())
-                places.setdefault(name, []).append((draft.tell(), len(content)))
+                block_spans.setdefault(name, []).append((draft.tell(), len(content)))
                 draft.write(content)
         start_row += block.num_rows
     described = "" if schema is None else base64.b64encode(schema.serialize().to_pybytes()).decode()
-    index = json.dumps({"schema": described, "places": places}).encode()
+    index = json.dumps({"schema": described, "places": block_spans}).encode()
     draft.write(index)
     draft.write(len(index).to_bytes(_LENGTH, "little"))
 
@@ -84,15 +84,18 @@ def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indice
         length = int.from_bytes(file.read(_LENGTH), "little")
         file.seek(-_LENGTH - length, 2)
         index: CutIndex = json.loads(file.read(length))
-        for place, size in index["places"].get(recording, ()):
-            file.seek(place)
+        for offset, size in index["places"].get(recording, ()):
+            file.seek(offset)
             schema = pa.ipc.read_schema(owned(base64.b64decode(index["schema"])))
             table = pa.Table.from_batches([pa.ipc.read_record_batch(owned(file.read(size)), schema)])
             yield table.drop_columns([ROW_COLUMN]), table.column(table.num_columns - 1).to_numpy()
 
 
 def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Iterator[tuple[str, pa.Table]]:
-    """Yield the rows of each recording in a block, in order."""
+    """Yield each recording in a block with its rows and their positions in the file, in order.
+
+    The positions count from ``start_row`` and are the last column.
+    """
     column = block.column(recording).cast(pa.string()).combine_chunks().dictionary_encode()
     codes, names = column.indices.fill_null(-1).to_numpy(zero_copy_only=False), column.dictionary.to_pylist()
     order = np.argsort(codes, kind="stable")
@@ -239,7 +242,10 @@ def _select_rows(
     recording: str | None,
     shared: Shared | None,
 ) -> Iterator[tuple[pa.Table, Indices]]:
-    """Yield the blocks of a file, or of a recording in it, with the positions of their rows in the file."""
+    """Yield the blocks of a file, or of a recording in it, with the positions of their rows in the file.
+
+    With ``shared``, a file of several recordings is split into them only once.
+    """
     if stream.recording and shared is not None:
 
         def cut(draft: Draft) -> None:

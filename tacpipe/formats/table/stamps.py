@@ -58,7 +58,7 @@ def has_date(text: str) -> bool:
 
 
 def format_expression(text: str) -> str:
-    """Return the regular expression of a format, with a group for each directive.
+    """Return the regular expression of a ``strptime`` format, with a group for each directive.
 
     A fraction of a second is optional, because Python omits it if it is zero.
     """
@@ -71,17 +71,16 @@ def format_expression(text: str) -> str:
         elif match["letter"]:
             regex += f"(?P<{match['letter']}>{_DIRECTIVES[match['letter']]})"
         else:
-            regex += "".join(
-                letter if letter.isalnum() or letter == " " else f"[{letter}]" if letter != "^" else r"\^"
-                for letter in match["text"]
-            )
+            for letter in match["text"]:
+                literal = r"\^" if letter == "^" else f"[{letter}]"
+                regex += letter if letter.isalnum() or letter == " " else literal
     return f"^{regex}$"
 
 
 def parse_stamps(column: pa.Array, time_format: str) -> tuple[Int64s, Bools]:
-    """Return timestamps in nanoseconds since 1970 (ignoring the time zone) or since midnight, and whether each is valid.
+    """Return timestamps in ns (row,) since 1970 or since midnight, and whether each is valid (row,).
 
-    ``column`` contains text in the ``strptime`` format ``time_format``; both results have the shape (row,).
+    ``column`` contains text in the ``strptime`` format ``time_format``; its time zone is ignored.
 
     >>> import pyarrow as pa
     >>> parse_stamps(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
@@ -152,31 +151,37 @@ def nanoseconds(column: pa.Array, time: Time) -> Int64s:
     >>> nanoseconds(pa.array(["1970-01-01T01:00:00.5+01:00"]), Time(unit="iso8601"))
     array([500000000])
     """
-    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    _refuse_flagged(column.is_null(), column, "a time; the cell is empty")
-    if pa.types.is_timestamp(column.type):
-        if column.type.tz is None and time.zone != "UTC":
-            column = pc.assume_timezone(column, time.zone)
-        stamps = _cast(column, pa.timestamp("ns", column.type.tz), IN_RANGE).cast(pa.int64())
+    values = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    _refuse_flagged(values.is_null(), values, "a time; the cell is empty")
+    if pa.types.is_timestamp(values.type):
+        is_local = values.type.tz is None and time.zone != "UTC"
+        zoned = pc.assume_timezone(values, time.zone) if is_local else values
+        stamps = _cast(zoned, pa.timestamp("ns", zoned.type.tz), IN_RANGE).cast(pa.int64())
         return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
-    if pa.types.is_time(column.type):
-        return _to_utc(np.asarray(column.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
+    if pa.types.is_time(values.type):
+        return _to_utc(np.asarray(values.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
     if time.format:
-        return _from_format(column, time)
+        return _from_format(values, time)
     if time.unit == "iso8601":
-        return _from_iso_text(column, time.zone)
+        return _from_iso_text(values, time.zone)
     unit = time.unit
-    if pa.types.is_decimal(column.type):
-        return _from_decimals(column, DIGITS[unit])
-    if pa.types.is_integer(column.type):
-        return _from_integers(column, 10 ** DIGITS[unit])
-    return _from_floats(column, 10 ** DIGITS[unit])
+    if pa.types.is_decimal(values.type):
+        return _from_decimals(values, DIGITS[unit])
+    if pa.types.is_integer(values.type):
+        return _from_integers(values, 10 ** DIGITS[unit])
+    return _from_floats(values, 10 ** DIGITS[unit])
 
 
 def _from_iso_text(column: pa.Array, zone: str) -> Int64s:
+    """Return the times in ISO 8601 texts in ns (row,).
+
+    Texts have a zone if the first has one, else they are in ``zone``.
+
+    Raises `StampError` for a text of another form.
+    """
     text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
-    zoned = [bool(_ZONED.fullmatch(first)) for first in text[:1].to_pylist()]
-    if zoned == [True]:
+    has_zone = [bool(_ZONED.fullmatch(first)) for first in text[:1].to_pylist()]
+    if has_zone == [True]:
         expected = "a time in ISO 8601, with a zone, as the first row has one"
         stamps = _cast(text, pa.timestamp("ns", "UTC"), expected)
     else:
@@ -207,6 +212,7 @@ def _to_utc(t_ns: Int64s, zone: str) -> Int64s:
 
 
 def _from_decimals(column: pa.Array, digits: int) -> Int64s:
+    """Return decimals with ``digits`` relevant decimals as ns (row,). Raises `StampError` for times out of range."""
     if column.type == DECIMAL:
         high, low = _decimal_words(column)
         _refuse_flagged(pa.array(np.abs(high) > _BEYOND), column, IN_RANGE)
@@ -260,6 +266,7 @@ def _from_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> In
 
 
 def _from_integers(column: pa.Array, factor: int) -> Int64s:
+    """Return integers in units of ``factor`` ns as ns (row,). Raises `StampError` for times out of range."""
     values = column.to_numpy(zero_copy_only=False)
     limit = np.iinfo(np.int64).max // factor
     _refuse_flagged(
@@ -272,6 +279,7 @@ def _from_integers(column: pa.Array, factor: int) -> Int64s:
 
 
 def _from_floats(column: pa.Array, factor: int) -> Int64s:
+    """Return floats in units of ``factor`` ns as ns (row,). Raises `StampError` for times out of range."""
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
     _refuse_flagged(pa.array(bad), column, IN_RANGE)

@@ -76,6 +76,7 @@ class _Recoded(io.RawIOBase):
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read converted text into ``buffer`` and return the number of bytes."""
         while not self._waiting:
             block = self._file.read(RECODED_BYTES)
             self._waiting = self._decoder.decode(block, final=not block).removeprefix("\ufeff").encode()
@@ -117,10 +118,10 @@ class TextTable:
                     f"{self.path}, line {line}: the header is not {self.stream.encoding}. Set encoding in "
                     f'[streams.{self.stream.name}], as encoding = "cp1252".'
                 )
-            doubled = sorted(name for name, count in Counter(names).items() if count > 1)
-            if doubled:
+            repeated = sorted(name for name, count in Counter(names).items() if count > 1)
+            if repeated:
                 raise TacpipeError(
-                    f"{self.path}: the header has more than one column {listed(doubled, 4)}. Rename one, or set "
+                    f"{self.path}: the header has more than one column {listed(repeated, 4)}. Rename one, or set "
                     f"header = false and skip_lines = 1, after which columns are named column1, column2 and so on."
                 )
             return names
@@ -129,22 +130,22 @@ class TextTable:
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns in ``types`` block by block. Raises `TacpipeError` with the line of an invalid row."""
         names = self.names()
-        parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
+        parse_options = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
         read_options = pc.ReadOptions(column_names=names, use_threads=True)
         rounded_types = {name: pa.float64() for name, kind in types.items() if pa.types.is_decimal(kind)}
 
-        def parsed(block: Sequence[bytes | memoryview], kinds: Mapping[str, pa.DataType]) -> pa.Table:
-            return pc.read_csv(pa.BufferReader(owned(*block)), read_options, parse, self._conversion(kinds))
+        def parse_block(block: Sequence[bytes | memoryview], kinds: Mapping[str, pa.DataType]) -> pa.Table:
+            return pc.read_csv(pa.BufferReader(owned(*block)), read_options, parse_options, self._conversion(kinds))
 
         for block in self._blocks():
             try:
-                table = parsed(block, types)
+                table = parse_block(block, types)
                 if rounded_types and any(
-                    stamps.overflows(column).any() for column in parsed(block, rounded_types).columns
+                    stamps.overflows(column).any() for column in parse_block(block, rounded_types).columns
                 ):
                     raise pa.ArrowInvalid("A number is too large")
             except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-                fault = self._first_fault(names, types)
+                fault = self._describe_first_fault(names, types)
                 raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
             yield table
 
@@ -177,32 +178,36 @@ class TextTable:
         raise IndexError(f"{self.path} has no row {index}.")
 
     def _blocks(self) -> Iterator[tuple[bytes | memoryview, ...]]:
-        """Yield the bytes below the header in whole lines without comments, each as several pieces."""
+        """Yield the bytes below the header in whole lines without comments, each as several pieces.
+
+        Raises `TacpipeError` if a line is too long.
+        """
         comment = self.stream.comment.encode()
-        drop = re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
+        comment_lines = (
+            re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
+        )
         with open_text(self.path, self.stream.encoding) as file:
             self._skip_header(file)
             remainder = b""
             while new := file.read(BLOCK_BYTES):
                 end = new.rfind(b"\n") + 1
                 if end:
-                    yield from self._drop_matches(drop, remainder, memoryview(new)[:end])
+                    yield from self._drop_matches(comment_lines, remainder, memoryview(new)[:end])
                 remainder = new[end:] if end else remainder + new
                 if len(remainder) > MAX_LINE_BYTES:
                     raise self._endless_line()
-            yield from self._drop_matches(drop, remainder)
+            yield from self._drop_matches(comment_lines, remainder)
 
     def _drop_matches(
         self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
     ) -> Iterator[tuple[bytes | memoryview, ...]]:
         """Yield pieces that end with a line, without the matches of ``drop``; nothing if no line has content."""
-        if drop is not None:
-            pieces = (drop.sub(b"", b"".join(pieces)),)
-        if any(_NOT_BLANK.search(piece) for piece in pieces):
-            yield pieces
+        retained = pieces if drop is None else (drop.sub(b"", b"".join(pieces)),)
+        if any(_NOT_BLANK.search(piece) for piece in retained):
+            yield retained
 
     def _skip_header(self, file: IO[bytes]) -> None:
-        """Read up to the first line below the header."""
+        """Skip the lines up to the first one below the header."""
         if not (self.stream.header or self.stream.skip_lines):
             if is_utf8(self.stream.encoding) and file.read(len(BOM)) != BOM:
                 file.seek(0)
@@ -215,8 +220,8 @@ class TextTable:
             if not line:
                 return
             text = (line.removeprefix(BOM) if not number else line).strip()
-            commented = bool(comment) and text.startswith(comment)
-            header &= number < self.stream.skip_lines or not text or commented
+            is_comment = bool(comment) and text.startswith(comment)
+            header &= number < self.stream.skip_lines or not text or is_comment
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield number and cells of each non-empty line, including the header.
@@ -242,7 +247,7 @@ class TextTable:
     def _endless_line(self) -> TacpipeError:
         return TacpipeError(f"{self.path} has a line of over {MAX_LINE_BYTES} bytes; it is not a text table.")
 
-    def _first_fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
+    def _describe_first_fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
         """Return a sentence about the first row that does not match the declaration, or None."""
         rows = self.rows()
         if self.stream.header:
@@ -265,18 +270,19 @@ class TextTable:
         return "Correct the cell, or declare it in missing."
 
     def _is_allowed(self, cell: str, kind: pa.DataType) -> bool:
+        """Return whether a cell can be read as a value of this type, or means a missing value."""
         if cell in self.stream.missing:
             return True
 
-        def parse(kind: pa.DataType) -> pa.ChunkedArray:
+        def parse_as(kind: pa.DataType) -> pa.ChunkedArray:
             text = pa.BufferReader(owned(f'"{cell}"\n'.encode()))
             read_options = pc.ReadOptions(column_names=["x"], use_threads=False)
             options = pc.ConvertOptions(column_types={"x": kind}, null_values=[], decimal_point=self.stream.decimal)
             return pc.read_csv(text, read_options, convert_options=options)["x"]
 
         try:
-            parse(kind)
-            return not (pa.types.is_decimal(kind) and stamps.overflows(parse(pa.float64())).any())
+            parse_as(kind)
+            return not (pa.types.is_decimal(kind) and stamps.overflows(parse_as(pa.float64())).any())
         except (pa.ArrowInvalid, UnicodeDecodeError):
             return False
 
@@ -313,7 +319,7 @@ class Workbook:
 
         Raises `TacpipeError` if a name is repeated or there is no row.
         """
-        with self._rows() as rows:
+        with self._open_rows() as rows:
             first = next(rows, None)
             if first is None:
                 raise TacpipeError(f"{self.path} has no row. Remove it, or record it again.")
@@ -325,15 +331,15 @@ class Workbook:
         if not self.stream.header:
             return [f"column{number}" for number in range(1, len(cells) + 1)]
         names = [str(cell).strip() if cell is not None else f"column{n}" for n, cell in enumerate(cells, 1)]
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
-            raise TacpipeError(f"{self.path}: the header has more than one column {listed(doubled, 4)}. Rename one.")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise TacpipeError(f"{self.path}: the header has more than one column {listed(repeated, 4)}. Rename one.")
         return names
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns in ``types`` in blocks of rows. Raises `TacpipeError` for an invalid cell."""
         names = self.names()
-        with self._rows() as rows:
+        with self._open_rows() as rows:
             if self.stream.header:
                 next(rows, None)
             while block := list(itertools.islice(rows, BLOCK_ROWS)):
@@ -343,19 +349,26 @@ class Workbook:
 
     def place(self, index: int) -> str:
         """Return the sheet's row of the data row ``index`` (from 0), for error messages."""
-        with self._rows() as rows:
+        with self._open_rows() as rows:
             numbers = (number for number, _ in rows)
             return f"row {next(itertools.islice(numbers, index + self.stream.header, None))}"
 
-    def _column(self, name: str, kind: pa.DataType, block: list[tuple[int, tuple[Any, ...]]], place: int) -> pa.Array:
-        """Return the cells of a column; timestamps have the type of the sheet."""
-        cells = [cells[place] if place < len(cells) else None for _, cells in block]
-        cells = [None if isinstance(cell, str) and cell in ("", *self.stream.missing) else cell for cell in cells]
+    def _column(
+        self, name: str, kind: pa.DataType, block: list[tuple[int, tuple[Any, ...]]], column_index: int
+    ) -> pa.Array:
+        """Return the cells of a column as ``kind``, or as floats or booleans; timestamps have the type of the sheet.
+
+        Raises `TacpipeError` for the first cell of another type.
+        """
+        missing = ("", *self.stream.missing)
+        cells = [row_cells[column_index] if column_index < len(row_cells) else None for _, row_cells in block]
+        cells = [None if isinstance(cell, str) and cell in missing else cell for cell in cells]
         if pa.types.is_string(kind) and any(isinstance(cell, str) for cell in cells):
             return pa.array([cell if cell is None else str(cell) for cell in cells], kind)
         try:
             is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
-            return pa.array(cells, pa.float64() if is_number else kind if pa.types.is_boolean(kind) else None)
+            boolean = kind if pa.types.is_boolean(kind) else None
+            return pa.array(cells, pa.float64() if is_number else boolean)
         except (pa.ArrowInvalid, pa.ArrowTypeError):
             row, cell = next(
                 (row, cell)
@@ -368,8 +381,11 @@ class Workbook:
             ) from None
 
     @contextlib.contextmanager
-    def _rows(self) -> Iterator[Iterator[tuple[int, tuple[Any, ...]]]]:
-        """Yield the number and the cells of each nonempty row below the lines to skip."""
+    def _open_rows(self) -> Iterator[Iterator[tuple[int, tuple[Any, ...]]]]:
+        """Open the workbook in the block, and yield the number and the cells of each nonempty row below the lines to skip.
+
+        Raises `TacpipeError` if the file is not a workbook or lacks the sheet.
+        """
         with extras.explain_missing("Reading .xlsx"):
             import openpyxl
         try:
