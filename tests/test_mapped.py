@@ -31,7 +31,7 @@ def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of
         rng.normal(size=(900, 12)),
         np.asfortranarray(rng.normal(size=(20, 30))),
     ]
-    copies = [mapped_arrays.kept(array) for array in arrays]
+    copies = [mapped_arrays.keep(array) for array in arrays]
     filled = mapped_arrays.empty((50, 2), np.float32)
     filled[:] = 3
     mapped_arrays.release()
@@ -65,4 +65,4 @@ def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(StorageError, match=f"The disk under {tempfile.gettempdir()} is full"):
-        MappedArrays(0).kept(np.zeros(10))
+        MappedArrays(0).keep(np.zeros(10))

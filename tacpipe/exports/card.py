@@ -89,6 +89,7 @@ def croissant_json(about: About, described: Contents, patterns: Mapping[str, str
 
 
 def _file_set(stream: str, pattern: str) -> dict[str, str]:
+    """Return the description of a stream's files in Croissant."""
     return {
         "@type": "cr:FileSet",
         "@id": f"{stream}-files",
@@ -102,6 +103,7 @@ CroissantField = dict[str, str | dict[str, dict[str, str]]]
 
 
 def _record_set(stream: str, columns: Sequence[Column]) -> dict[str, str | list[CroissantField]]:
+    """Return the description of a stream's columns in Croissant, without those of types that it does not support."""
     recording = Column("recording", "string", {"quantity": "name of the recording"})
     described_columns = [
         recording,
@@ -125,15 +127,16 @@ def column_ids(names: Sequence[str]) -> dict[str, str]:
     """
     ids: dict[str, str] = {}
     for name in names:
-        letters = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
-        candidate, number = letters, 2
+        base = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+        candidate, number = base, 2
         while candidate in ids.values():
-            candidate, number = f"{letters}_{number}", number + 1
+            candidate, number = f"{base}_{number}", number + 1
         ids[name] = candidate
     return ids
 
 
 def _field(stream: str, column: Column, identifier: str) -> CroissantField:
+    """Return the description of a column in Croissant."""
     return {
         "@type": "cr:Field",
         "@id": f"{stream}/{identifier}",
@@ -227,7 +230,7 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
 
 def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
-    """Yield the losses of a stream in the card."""
+    """Yield what the card cannot represent of a stream: types without an equivalent, and a column named like `RECORDING`."""
     for field in schema:
         if not croissant_type(str(field.type)):
             reason = f"{NAME} has no type for {field.type}; the Parquet files have the column"
@@ -262,6 +265,7 @@ def _labels(recordings: Dataset) -> bytes:
 
 
 def _readme(params: Params, recordings: Dataset, described: Contents, patterns: dict[str, str]) -> bytes:
+    """Return the text of README.md: metadata, title, description, an example and the sections of all exports."""
     front = "\n".join(["---", *_front_matter(params, patterns), "---"])
     parts = [
         front,
@@ -289,6 +293,7 @@ def _front_matter(params: Params, patterns: dict[str, str]) -> Iterator[str]:
 
 
 def _opening_example(described: Contents) -> str:
+    """Return a code example that opens the files of the first stream."""
     stream = next((stream_label(name) for name in described.streams), "STREAM")
     return f"""```python
 import datasets, duckdb, polars

@@ -107,9 +107,9 @@ def part(
         t_ns = table.column(TIME).to_numpy() if TIME in table.column_names and table.num_rows else None
         rate_hz = streams.rate_hz(table)
         floats = (table.column(field.name).to_numpy() for field in table.schema if pa.types.is_floating(field.type))
-        nan = any(bool(np.isnan(values).any()) for values in floats)
-        ends = (int(t_ns[0]), int(t_ns[-1])) if t_ns is not None else (None, None)
-        rows.append((name, table.num_rows, *ends, rate_hz, nan))
+        has_nan = any(bool(np.isnan(values).any()) for values in floats)
+        first_and_last_ns = (int(t_ns[0]), int(t_ns[-1])) if t_ns is not None else (None, None)
+        rows.append((name, table.num_rows, *first_and_last_ns, rate_hz, has_nan))
     all_losses = list(losses)
     if carried is not None:
         all_losses += unwritten_losses([(stream, column) for stream, column, *_ in columns], carried, all_losses)
@@ -146,9 +146,11 @@ def unwritten_losses(
     named_losses = {(loss.stream, loss.column) for loss in losses}
     carried_streams = {stream for stream, column in carried if column != TIME}
     missing = [name for name in names if name not in carried and not {name, (name[0], "")} & named_losses]
-    empty = {stream for stream, _ in names} - carried_streams - {stream for stream, _ in named_losses}
-    empty &= {stream for stream, _ in missing}
-    return list(dict.fromkeys(Loss(reason, stream, "" if stream in empty else column) for stream, column in missing))
+    unwritten_streams = {stream for stream, _ in names} - carried_streams - {stream for stream, _ in named_losses}
+    unwritten_streams &= {stream for stream, _ in missing}
+    return list(
+        dict.fromkeys(Loss(reason, stream, "" if stream in unwritten_streams else column) for stream, column in missing)
+    )
 
 
 def loss_sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
@@ -168,6 +170,7 @@ def loss_sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
 
 
 def _sentence(stream: str | None, columns: Collection[str], reason: str) -> str:
+    """Return a sentence about a loss of columns, of a whole stream, or of a recording (``stream`` is None)."""
     if stream is None:
         return reason
     place = f"stream {plain(stream_label(stream))}"
@@ -216,8 +219,8 @@ class _StreamTotals:
         self.rates_hz += [row["rate_hz"]] if row["rate_hz"] else []
         if _without_codecs(columns) != _without_codecs(self.columns):
             self.differing.append(recording)
-            alike = {(column.name, column.type) for column in columns}
-            self.shared = [column for column in self.shared if (column.name, column.type) in alike]
+            columns_present = {(column.name, column.type) for column in columns}
+            self.shared = [column for column in self.shared if (column.name, column.type) in columns_present]
             self.all_columns |= dict.fromkeys(column.name for column in columns)
 
     def stream(self, name: str) -> ExportStream:
@@ -250,10 +253,10 @@ def contents_from_parts(parts: Dataset) -> Contents:
             columns = tables[key][row["stream"]]
             empty = _StreamTotals(columns, columns, dict.fromkeys(column.name for column in columns))
             totals.setdefault(row["stream"], empty).add(part.name, row, columns)
-        stamped = [row for row in rows if row["first_ns"] is not None]
-        if stamped:
-            starts.append(min(row["first_ns"] for row in stamped))
-            seconds += (max(row["last_ns"] for row in stamped) - starts[-1]) / 1e9
+        timed = [row for row in rows if row["first_ns"] is not None]
+        if timed:
+            starts.append(min(row["first_ns"] for row in timed))
+            seconds += (max(row["last_ns"] for row in timed) - starts[-1]) / 1e9
         losses += [(part.name, Loss(**row)) for row in part.table(LOSSES).to_pylist()]
     merged = {name: total.stream(name) for name, total in sorted(totals.items())}
     return Contents(merged, seconds, min(starts, default=None), loss_sentences(losses))
@@ -265,6 +268,7 @@ def field_metadata(field: pa.Field) -> dict[str, str]:
 
 
 def _columns_by_stream(rows: Iterable[ColumnRow]) -> dict[str, tuple[Column, ...]]:
+    """Return the columns of each stream from the rows of the table `COLUMNS`."""
     columns_by_name: dict[str, list[Column]] = {}
     for row in rows:
         columns_by_name.setdefault(row["stream"], []).append(
@@ -274,6 +278,7 @@ def _columns_by_stream(rows: Iterable[ColumnRow]) -> dict[str, tuple[Column, ...
 
 
 def _make_table(rows: Sequence[Sequence[Any]], /, **types: pa.DataType) -> pa.Table:
+    """Return a table of rows with the columns ``types``."""
     import pyarrow as pa
 
     columns = list(zip(*rows, strict=True)) if rows else [()] * len(types)

@@ -56,7 +56,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     for stream in recording.streams:
         stored = recording.columns(stream)
         losses += list(_losses(stream, stored))
-        writers[f"{name}/{stream_label(stream)}.csv"] = functools.partial(_write, stored)
+        writers[f"{name}/{stream_label(stream)}.csv"] = functools.partial(_write_csv, stored)
     return Result({"": RecordingOutput(contents.part(recording, losses))}, written=writers)
 
 
@@ -91,6 +91,7 @@ def layout_text(described: Contents) -> str:
 
 
 def _stream_lines(stream: ExportStream, *, optional: bool) -> Iterator[str]:
+    """Yield the lines of a ``[streams.NAME]`` entry of the layout."""
     yield ""
     yield f"[streams.{stream_label(stream.name)}]"
     yield f"files = {json.dumps(f'{{recording}}/{stream_label(stream.name)}.csv')}"
@@ -123,7 +124,7 @@ def _quote(value: str) -> str:
     return json.dumps(value, ensure_ascii=True)  # the same syntax as a basic string in TOML
 
 
-def _write(stored: Columns, sink: Any) -> None:
+def _write_csv(stored: Columns, sink: Any) -> None:
     """Write a stream as CSV: floats with the fewest digits that restore the same bits, NaN as ``nan``."""
     import pyarrow.csv as pc
 
@@ -153,7 +154,7 @@ def _writable_column(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
-    """Yield the losses of a stream in CSV and the layout."""
+    """Yield what CSV and the layout cannot represent of a stream."""
     import numpy as np
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -156,6 +156,7 @@ def provenance(recordings: Dataset) -> str:
 
 
 def _contents(recordings: Dataset, contents: Contents) -> str:
+    """Return the section with number, duration and date of the recordings, and labels with few values."""
     lines = ["## What it holds", "", f"- {len(recordings)} recordings, {contents.seconds:.1f} s"]
     if contents.first_ns is not None and contents.first_ns > 0:
         lines.append(f"- recorded from {datetime.fromtimestamp(contents.first_ns // 10**9, UTC):%Y-%m-%d} (UTC)")
@@ -168,6 +169,7 @@ def _contents(recordings: Dataset, contents: Contents) -> str:
 
 
 def _labels(recordings: Dataset) -> Mapping[str, Counter[str]]:
+    """Return the number of recordings by value of each label that is text or boolean."""
     counts: dict[str, Counter[str]] = {}
     for recording in recordings:
         for name, value in recording.attributes.items():
@@ -177,6 +179,7 @@ def _labels(recordings: Dataset) -> Mapping[str, Counter[str]]:
 
 
 def _streams(contents: Contents) -> str:
+    """Return the section with a table of the streams."""
     lines = [
         "## Streams",
         "",

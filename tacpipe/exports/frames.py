@@ -89,7 +89,7 @@ def synchronized_columns(recording: Recording) -> Columns:
 def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
     """Return the columns of the frames, and ``described`` with the omitted columns added to its losses.
 
-    If the columns of recordings differ, only those that all recordings have are used if ``common``, otherwise
+    If the columns of recordings differ, only those that all recordings have are used if ``common`` is set, otherwise
     `UsageError` is raised.
     """
     (stream,) = described.streams.values()
@@ -158,9 +158,8 @@ def state_channels(all_channels: Sequence[Channel], streams: Sequence[str]) -> l
     for name in streams:
         if name not in streams_present:
             raise UsageError(f"There is no stream {plain(name)} in these frames; there are {listed(streams_present)}.")
-    robots = streams or [
-        channel for channel in streams_present if any(c.stream == channel and c.quantity in ROBOT for c in all_channels)
-    ]
+    with_robot_columns = {channel.stream for channel in all_channels if channel.quantity in ROBOT}
+    robots = streams or [stream for stream in streams_present if stream in with_robot_columns]
     return [
         channel
         for channel in all_channels
@@ -196,30 +195,30 @@ def value_blocks(
 
     With ``later``, each row has the values of the next one, and the last row its own.
     """
-    waiting: AnyArray | None = None
+    previous_block: AnyArray | None = None
     for table in columns.batches([channel.name for channel in chosen]):
         with np.errstate(over="ignore"):
             values = np.column_stack([table.column(channel.name).to_numpy() for channel in chosen]).astype(kind)
         if not later:
             yield values
             continue
-        if waiting is not None:
-            yield np.concatenate([waiting[1:], values[:1]])
-        waiting = values
-    if waiting is not None:
-        yield np.concatenate([waiting[1:], waiting[-1:]])
+        if previous_block is not None:
+            yield np.concatenate([previous_block[1:], values[:1]])
+        previous_block = values
+    if previous_block is not None:
+        yield np.concatenate([previous_block[1:], previous_block[-1:]])
 
 
 def rounded_channels(columns: Columns, chosen: Sequence[Channel]) -> list[Channel]:
     """Return the channels that float32 cannot represent exactly."""
-    lossy = []
+    rounded = []
     for channel in chosen:
         values = columns.column(channel.name).to_numpy()
         with np.errstate(over="ignore"):
-            back = values.astype(np.float32).astype(values.dtype)
-        if not np.array_equal(values, back, equal_nan=values.dtype.kind == "f"):
-            lossy.append(channel)
-    return lossy
+            restored = values.astype(np.float32).astype(values.dtype)
+        if not np.array_equal(values, restored, equal_nan=values.dtype.kind == "f"):
+            rounded.append(channel)
+    return rounded
 
 
 def common_rate_hz(recordings: Sequence[Recording]) -> float:
@@ -286,7 +285,7 @@ class FrameArray:
 def arrays_of_frames(columns: Columns, actions: str = "") -> list[FrameArray]:
     """Return the arrays of a synchronized recording: the time, one per stream and quantity, and last the actions, if any.
 
-    Columns that are not numbers are omitted.
+    Masks and labels have an array each. Columns that are not numbers are omitted.
     """
     signals = channels(columns)
     groups: dict[str, list[Channel]] = {TIME: [Channel(TIME, "", "time", "ns", "int64")]}
@@ -295,8 +294,8 @@ def arrays_of_frames(columns: Columns, actions: str = "") -> list[FrameArray]:
             groups.setdefault(_name(channel), []).append(channel)
     arrays = [FrameArray(name, members) for name, members in groups.items()]
     if actions:
-        members, later = action_channels(signals, actions)
-        arrays.append(FrameArray(ACTIONS, members, actions=True, later=later))
+        members, is_next_frame = action_channels(signals, actions)
+        arrays.append(FrameArray(ACTIONS, members, actions=True, later=is_next_frame))
     return arrays
 
 

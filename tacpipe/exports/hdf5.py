@@ -107,7 +107,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
         return Result({"": RecordingOutput(frames.describe(recording))})
     losses: list[Loss] = []
     columns: list[ColumnName] = []
-    content = _recording(params, recording, losses, columns)
+    content = _write_recording(params, recording, losses, columns)
     tables = contents.part(recording, losses, columns)
     return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copy_to_sink(content)})
 
@@ -131,7 +131,7 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
         columns, described = frames.frame_columns(described, common=params.common)
         described = frames.add_frame_losses(described, recordings, originals)
         losses: list[tuple[str, Loss]] = []
-        content = _demos(params, recordings, columns, roles, losses)
+        content = _write_demos(params, recordings, columns, roles, losses)
         described = replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
         opening, writers[DEMOS] = _DEMOS, copy_to_sink(content)
         missing = [recording.name for recording in recordings if roles and recording.name not in roles]
@@ -147,7 +147,7 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
     return Result(files=Files({files.README_NAME: text}), notes=notes, written=writers)
 
 
-def _recording(params: Params, recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
+def _write_recording(params: Params, recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> Scratch:
     """Return a temporary file with a recording, because HDF5 does not write sequentially.
 
     Adds losses to ``losses`` and written columns to ``columns``.
@@ -245,8 +245,8 @@ def _write_array(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.
     import h5py
 
     path, kind, shape = _demo_path(array), array.type_in(columns), array.shape(columns.num_rows)
-    place, _, name = path.rpartition("/")
-    group = demo.require_group(place) if place else demo
+    group_path, _, name = path.rpartition("/")
+    group = demo.require_group(group_path) if group_path else demo
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_obj_track_times(False)  # equal recordings give equal bytes
     if shape[0]:
@@ -262,23 +262,23 @@ def _write_array(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.
 
 
 def _chunks(blocks: Iterable[AnyArray]) -> Iterator[tuple[int, AnyArray]]:
-    """Yield the rows of blocks in whole chunks with the index of their first row, so that each chunk is compressed once."""
+    """Yield the rows of blocks in whole chunks, each with the index of its first row, so that it is compressed once."""
     import numpy as np
 
-    waiting: list[AnyArray] = []
+    buffered: list[AnyArray] = []
     first_row = count = 0
     for block in blocks:
-        waiting.append(block)
+        buffered.append(block)
         count += len(block)
         while count >= CHUNK_ROWS:
-            rows = np.concatenate(waiting)
+            rows = np.concatenate(buffered)
             yield first_row, rows[:CHUNK_ROWS]
-            waiting, count, first_row = [rows[CHUNK_ROWS:]], count - CHUNK_ROWS, first_row + CHUNK_ROWS
+            buffered, count, first_row = [rows[CHUNK_ROWS:]], count - CHUNK_ROWS, first_row + CHUNK_ROWS
     if count:
-        yield first_row, np.concatenate(waiting)
+        yield first_row, np.concatenate(buffered)
 
 
-def _demos(
+def _write_demos(
     params: Params,
     recordings: Dataset,
     columns: Sequence[str],

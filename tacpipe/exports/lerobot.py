@@ -100,8 +100,8 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
 
     columns = frames.synchronized_columns(recording)
     losses = list(_losses(params, columns, str(recording.attributes[GRID])))
-    params = params if not params.actions or _has_stream(columns, params.actions) else replace(params, actions="")
-    frame_features = features_of_frames(params, columns)
+    has_actions = bool(params.actions) and _has_stream(columns, params.actions)
+    frame_features = features_of_frames(params if has_actions else replace(params, actions=""), columns)
     rows = [
         (feature.name == ACTION, column, *values)
         for feature in frame_features
@@ -148,12 +148,12 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     files: dict[str, Content] = {}
     written: dict[str, Callable[[Any], object]] = {}
     starts: dict[str, int] = {}
-    places: dict[str, tuple[int, int]] = {}
+    file_numbers: dict[str, tuple[int, int]] = {}
     number = start = 0
     for index, bundle in enumerate(bundles):
         chunk, file = divmod(index, CHUNK_FILES)
         for recording in bundle:
-            starts[recording.name], places[recording.name] = start, (chunk, file)
+            starts[recording.name], file_numbers[recording.name] = start, (chunk, file)
             start += lengths[recording.name]
         episodes = _Episodes(columns, frame_features, bundle, number, starts, tasks, fps)
         written[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = episodes.write
@@ -162,18 +162,18 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
         for camera in cameras:
             video = videos[recording.name][camera.name]
             chunk, file = divmod(episode, CHUNK_FILES)
-            place = VIDEO_PATH.format(video_key=camera.name, chunk_index=chunk, file_index=file)
-            written[place] = video.write
+            video_path = VIDEO_PATH.format(video_key=camera.name, chunk_index=chunk, file_index=file)
+            written[video_path] = video.write
             losses += [(recording.name, loss) for loss in video.losses(camera.stream, _shards_note(params))]
     described = replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
     colours = {name: {key: video.statistics() for key, video in by_key.items()} for name, by_key in videos.items()}
-    files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
-        frame_features, all_recordings, parts, originals, starts, places, lengths, tasks, fps, colours
+    files["meta/episodes/chunk-000/file-000.parquet"] = _episodes_table(
+        frame_features, all_recordings, parts, originals, starts, file_numbers, lengths, tasks, fps, colours
     )
     files["meta/tasks.parquet"] = _task_table(tasks)
     files["meta/info.json"] = _json_bytes(_info(params, frame_features, cameras, lengths, tasks, fps))
-    order = _task_order(tasks)
-    indices = {name: order[task] for name, task in tasks.items()}
+    task_indices = _task_order(tasks)
+    indices = {name: task_indices[task] for name, task in tasks.items()}
     statistics = dataset_statistics(parts, frame_features, starts, lengths, indices, fps)
     for camera in cameras:
         statistics[camera.name] = combine_statistics([by_key[camera.name] for by_key in colours.values()])
@@ -184,24 +184,24 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
 
 
 def _losses(params: Params, columns: Columns, grid: str) -> Iterator[Loss]:
-    """Yield the losses of a synchronized recording in the features."""
+    """Yield what the features cannot represent of a synchronized recording."""
     from tacpipe.exports import frames
 
     channels = frames.channels(columns)
-    place = _shards_note(params)
-    yield Loss(f"rates of the streams and what happened between frames: one frame rate for all{place}")
+    ending = _shards_note(params)
+    yield Loss(f"rates of the streams and what happened between frames: one frame rate for all{ending}")
     if not params.originals:
         yield Loss("stream events, and types and units of the recorded streams (with --originals they are carried)")
     if grid != "uniform":
         times = f"{ORIGINALS}.{TIME} has the times"
         yield Loss(f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {times}")
-    lossy = frames.rounded_channels(columns, [channel for channel in channels if channel.signal])
-    for stream in dict.fromkeys(channel.stream for channel in lossy):
-        yield Loss(f"digits beyond float32{place}", stream)
+    rounded = frames.rounded_channels(columns, [channel for channel in channels if channel.signal])
+    for stream in dict.fromkeys(channel.stream for channel in rounded):
+        yield Loss(f"digits beyond float32{ending}", stream)
     for channel in _unsupported_channels(channels):
         if channel.quantity == frames.IMAGE:
             continue  # packets are in the videos
-        yield Loss(f"features have no type for {channel.type}{place}", channel.stream, channel.short)
+        yield Loss(f"features have no type for {channel.type}{ending}", channel.stream, channel.short)
 
 
 def _unsupported_channels(channels: Sequence[Channel]) -> list[Channel]:
@@ -225,7 +225,7 @@ def _row_count(parts: Dataset, name: str) -> int:
 
 
 def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:
-    """Return the task of each recording. Raises `UsageError` for a label that a recording lacks."""
+    """Return the task of each recording. Raises `UsageError` if a recording lacks a label that the task contains."""
     tasks = {}
     for recording in recordings:
         for label in _PLACE.findall(params.task):
@@ -246,16 +246,16 @@ def _fill_task(task: str, labels: Mapping[str, Attribute]) -> str:
 def _group_by_size(
     recordings: Sequence[Recording], lengths: Mapping[str, int], row_bytes: int
 ) -> Iterator[list[Recording]]:
-    """Yield the recordings of each data file."""
+    """Yield the recordings of each data file, which together have at most `FILE_BYTES`."""
     bundle: list[Recording] = []
     size = 0
     for recording in recordings:
-        bytes_ = lengths[recording.name] * row_bytes
-        if bundle and size + bytes_ > FILE_BYTES:
+        recording_bytes = lengths[recording.name] * row_bytes
+        if bundle and size + recording_bytes > FILE_BYTES:
             yield bundle
             bundle, size = [], 0
         bundle.append(recording)
-        size += bytes_
+        size += recording_bytes
     yield bundle
 
 
@@ -279,12 +279,16 @@ class _Episodes:
         from tacpipe.exports import frames
         from tacpipe.io.columns import release
 
-        order = _task_order(self.tasks)
+        task_indices = _task_order(self.tasks)
         names = [*(feature.name for feature in self.features), *INDICES]
         writer = None
         for episode, recording in enumerate(self.recordings, start=self.first_episode):
             columns = frames.synchronized_columns(recording).select(self.columns)
-            length, start, task = columns.num_rows, self.starts[recording.name], order[self.tasks[recording.name]]
+            length, start, task = (
+                columns.num_rows,
+                self.starts[recording.name],
+                task_indices[self.tasks[recording.name]],
+            )
             scratch = Scratch()
             release()
             features = [feature.put_aside(columns, scratch) for feature in self.features]
@@ -301,7 +305,10 @@ class _Episodes:
 
 
 def _index_columns(first: int, rows: int, episode: int, start: int, task: int, fps: float) -> list[pa.Array]:
-    """Return the columns `INDICES` for frames of an episode, starting with the frame ``first``."""
+    """Return the columns `INDICES` for ``rows`` frames of an episode, starting with the frame ``first``.
+
+    ``start`` is the index of the episode's first frame in the dataset.
+    """
     import numpy as np
     import pyarrow as pa
 
@@ -329,34 +336,35 @@ def _task_table(tasks: Mapping[str, str]) -> bytes:
     return sink.getvalue()
 
 
-def _episodes(
+def _episodes_table(
     frame_features: Sequence[FrameFeature],
     recordings: Sequence[Recording],
     parts: Dataset,
     originals: Dataset,
     starts: Mapping[str, int],
-    places: Mapping[str, tuple[int, int]],
+    file_numbers: Mapping[str, tuple[int, int]],
     lengths: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
     colours: Mapping[str, Stats],
 ) -> bytes:
+    """Return the table of the episodes, with their files, statistics and original attributes, as Parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    order = _task_order(tasks)
+    task_indices = _task_order(tasks)
     rows = []
     for episode, recording in enumerate(recordings):
-        chunk, file = places[recording.name]
+        chunk, file = file_numbers[recording.name]
         stats = episode_statistics(frame_features, parts[recording.name], lengths[recording.name])
         stats |= index_statistics(
-            lengths[recording.name], episode, starts[recording.name], order[tasks[recording.name]], fps
+            lengths[recording.name], episode, starts[recording.name], task_indices[tasks[recording.name]], fps
         )
         stats |= colours[recording.name]
         video_chunk, video_file = divmod(episode, CHUNK_FILES)
-        video_places = {"chunk_index": video_chunk, "file_index": video_file, "from_timestamp": 0.0}
-        video_places["to_timestamp"] = lengths[recording.name] / fps
-        row = {
+        video_entries = {"chunk_index": video_chunk, "file_index": video_file, "from_timestamp": 0.0}
+        video_entries["to_timestamp"] = lengths[recording.name] / fps
+        row: dict[str, Any] = {
             "episode_index": episode,
             "tasks": [tasks[recording.name]],
             "length": lengths[recording.name],
@@ -368,11 +376,11 @@ def _episodes(
             "meta/episodes/file_index": 0,
             RECORDING: recording.name,
             ATTRIBUTES: json.dumps(dict(originals[recording.name].attributes), sort_keys=True),
-            **{
-                f"videos/{name}/{key}": value for name in colours[recording.name] for key, value in video_places.items()
-            },
-            **{f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()},
         }
+        for name in colours[recording.name]:
+            row |= {f"videos/{name}/{key}": value for key, value in video_entries.items()}
+        for name, values in stats.items():
+            row |= {f"stats/{name}/{key}": value for key, value in values.items()}
         rows.append(row)
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
@@ -413,6 +421,7 @@ def _info(
     tasks: Mapping[str, str],
     fps: float,
 ) -> InfoJson:
+    """Return the content of info.json: totals, paths and features."""
     described: dict[str, FeatureJson | VideoFeatureJson] = {
         feature.name: {
             "dtype": feature.dtype,
@@ -450,7 +459,7 @@ class FeatureMetadata(TypedDict):
 
 
 def _feature_metadata(frame_features: Sequence[FrameFeature], described: contents.Contents) -> FeatureMetadata:
-    """Return units and quantities of each feature, and the columns of the synchronized table."""
+    """Return columns, units and quantities of each feature, and the columns of the synchronized table."""
     return {
         "features": {
             feature.name: {

@@ -71,7 +71,7 @@ class FrameFeature:
         return self.kind.itemsize * len(self.channels)
 
     def put_aside(self, columns: Columns, scratch: Scratch) -> Callable[[int, int], pa.Array]:
-        """Write a recording's values to a temporary file; return a function (first frame, frames) -> values.
+        """Write a recording's values to a temporary file; return a function from first frame and number of frames to values.
 
         Text stays in memory.
         """
@@ -108,32 +108,32 @@ def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
     taxels = [channel for channel in channels if channel.signal and channel.quantity == frames.TACTILE]
     state = [channel for channel in state if channel not in taxels]
 
-    def vector(name: str, members: Sequence[Channel], *, later: bool = False) -> FrameFeature:
-        one_stream = len({channel.stream for channel in members}) == 1
-        names = [channel.short if one_stream else channel.name for channel in members]
+    def make_vector(name: str, members: Sequence[Channel], *, later: bool = False) -> FrameFeature:
+        is_one_stream = len({channel.stream for channel in members}) == 1
+        names = [channel.short if is_one_stream else channel.name for channel in members]
         return FrameFeature(name, members, names, np.dtype(np.float32), later)
 
     vectors: list[FrameFeature] = []
     observed = [*state, *taxels] if params.tactile_in_state else state
-    vectors += [vector("observation.state", observed)] if observed else []
+    vectors += [make_vector("observation.state", observed)] if observed else []
     if params.actions:
         members, later = frames.action_channels(channels, params.actions)
-        vectors.append(vector(ACTION, members, later=later))
+        vectors.append(make_vector(ACTION, members, later=later))
     signals = [channel for channel in channels if channel.signal and channel not in state]
     for stream in dict.fromkeys(channel.stream for channel in signals):
-        touch = [channel for channel in signals if channel.stream == stream and channel in taxels]
+        tactile = [channel for channel in signals if channel.stream == stream and channel in taxels]
         remaining = [channel for channel in signals if channel.stream == stream and channel not in taxels]
-        vectors += [vector(f"observation.tactile.{stream}", touch)] if touch else []
-        vectors += [vector(f"observation.{stream}", remaining)] if remaining else []
+        vectors += [make_vector(f"observation.tactile.{stream}", tactile)] if tactile else []
+        vectors += [make_vector(f"observation.{stream}", remaining)] if remaining else []
     latents = [channel for channel in channels if channel.quantity == frames.LATENT]
-    vectors += [vector("observation.latents", latents)] if latents else []
+    vectors += [make_vector("observation.latents", latents)] if latents else []
     truth = [channel for channel in channels if channel.truth and channel.type in ("float", "double")]
-    vectors += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
+    vectors += [make_vector(f"{ORIGINALS}.truth", truth)] if truth else []
     time = frames.Channel(TIME, "", "time", "ns", "int64")
     vectors.append(FrameFeature(f"{ORIGINALS}.{TIME}", [time], [TIME], np.dtype(np.int64)))
-    placed = {channel.name for channel in (*state, *signals, *latents, *truth)}
+    used_channels = {channel.name for channel in (*state, *signals, *latents, *truth)}
     for channel in channels:
-        if channel.name not in placed and (channel.number or channel.type == "string"):
+        if channel.name not in used_channels and (channel.number or channel.type == "string"):
             name = f"{channel.short}.{channel.stream}" if channel.stream else channel.short
             name = f"{ORIGINALS}.{name.replace('/', '_')}"
             kind = frames.common_type(columns, [channel]) if channel.number else np.dtype(object)
@@ -148,7 +148,7 @@ Stats = dict[str, dict[str, list[Any]]]  # values by channel, by statistic, by f
 
 
 def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield each column of a feature with its statistics: none for text, and NaN if nothing was measured."""
+    """Yield each column of a feature with its statistics, zeros if nothing was measured; nothing for text."""
     import numpy as np
 
     if feature.dtype == "string":
@@ -162,6 +162,7 @@ def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple
 
 
 def _compute_statistics(values: Floats) -> tuple[float, ...]:
+    """Return minimum, maximum, mean, standard deviation and quantiles of the finite values; zeros if there are none."""
     import numpy as np
 
     finite = values[np.isfinite(values)]
@@ -177,8 +178,11 @@ def episode_statistics(features: Sequence[FrameFeature], part: Recording, rows: 
     statistics: Stats = {}
     for feature in features:
         if feature.dtype != "string":
-            mine = [rows_by_column[feature.name == ACTION, column] for column in feature.columns]
-            statistics[feature.name] = {**{name: [row[name] for row in mine] for name in STATISTICS}, "count": [rows]}
+            column_rows = [rows_by_column[feature.name == ACTION, column] for column in feature.columns]
+            statistics[feature.name] = {
+                **{name: [row[name] for row in column_rows] for name in STATISTICS},
+                "count": [rows],
+            }
     return statistics
 
 

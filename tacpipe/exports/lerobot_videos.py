@@ -195,6 +195,7 @@ class EpisodeVideo:
                 shutil.copyfileobj(file, sink, 1 << 20)
 
     def _copy(self, container: Any) -> None:
+        """Copy the packets of the rows to a video file, with presentation times of the dataset's rate."""
         import av
 
         from tacpipe.video.decoding import read_batches
@@ -216,6 +217,7 @@ class EpisodeVideo:
             container.mux_one(packet)
 
     def _encode(self, container: Any) -> None:
+        """Encode the images of the rows to a video file."""
         import av
 
         encoder, options = ENCODERS[self.codec]
@@ -238,8 +240,8 @@ class EpisodeVideo:
         """Return the statistics of the colours, 0 to 1, of evenly spaced frames, each as (colour, 1, 1)."""
         from tacpipe.video.decoding import read_frames
 
-        places = np.unique(np.linspace(0, len(self.rows) - 1, SAMPLED).round().astype(int))
-        images = list(read_frames(self.columns, self.rows[places].tolist()).values())
+        sampled_rows = np.unique(np.linspace(0, len(self.rows) - 1, SAMPLED).round().astype(int))
+        images = list(read_frames(self.columns, self.rows[sampled_rows].tolist()).values())
         pixels: Floats = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image in images)]) / 255
         values = {
             **{"min": pixels.min(0), "max": pixels.max(0), "mean": pixels.mean(0), "std": pixels.std(0)},

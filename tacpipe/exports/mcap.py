@@ -62,7 +62,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
     losses: list[Loss] = []
     streams = list(_streams(params, recording, losses))
-    write = functools.partial(_write, recording, name, streams)
+    write = functools.partial(_write_mcap, recording, name, streams)
     columns = [name for stream in streams for name in stream.columns]
     return Result({"": RecordingOutput(contents.part(recording, losses, columns))}, written={f"{name}.mcap": write})
 
@@ -91,14 +91,14 @@ class _Stream:
     ordered: bool  # whether the rows are ordered by time
 
 
-def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: Any) -> None:
-    """Write the MCAP file of a recording with only some rows of each stream in memory."""
+def _write_mcap(recording: Recording, name: str, streams: Sequence[_Stream], sink: Any) -> None:
+    """Write the MCAP file of a recording, ordered by time, with only some rows of each stream in memory."""
     from mcap.writer import CompressionType, Writer
 
     writer = Writer(sink, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library="tacpipe")
-    record = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
-    writer.add_metadata(RECORD, record)
+    metadata = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
+    writer.add_metadata(RECORD, metadata)
     messages = [message for stream in streams for message in _register_topics(writer, recording, stream)]
     for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda message: message[0])):
         writer.add_message(channel, log_ns, content, log_ns, number)
@@ -106,7 +106,7 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
 
 
 def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterator[_Stream]:
-    """Yield the streams that become topics; losses in the messages are added to ``losses``."""
+    """Yield the streams that become topics, and add to ``losses`` what the messages cannot represent."""
     import numpy as np
 
     from tacpipe.exports import ros
@@ -130,8 +130,8 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
             losses.append(Loss("its stamps lie before 1970 or after 2038, which ROS has no stamps for", stream))
             continue
         losses += _losses(stream, table)
-        head = ros.stream_topic(stream, table.schema.empty_table())
-        columns = [(stream, name) for name in (TIME, *(column["name"] for column in head.metadata["columns"]))]
+        first_topic = ros.stream_topic(stream, table.schema.empty_table())
+        columns = [(stream, name) for name in (TIME, *(column["name"] for column in first_topic.metadata["columns"]))]
         images = [name for name in table.column_names if _holds_images(table, name)] if params.usual_messages else []
         video_format = read_format(table) if params.usual_messages and not images and table.num_rows else None
         frames = None if video_format is None else Pictures(table, video_format)
@@ -164,9 +164,9 @@ def _topics(
     """Return the topics for a block of rows of a stream."""
     from tacpipe.exports import ros
 
-    usual = ros.usual_topics(stream, table, images) if params.usual_messages else []
-    usual += [frames.topic(stream, table)] if frames is not None else []
-    return [ros.stream_topic(stream, table), *usual]
+    standard = ros.usual_topics(stream, table, images) if params.usual_messages else []
+    standard += [frames.topic(stream, table)] if frames is not None else []
+    return [ros.stream_topic(stream, table), *standard]
 
 
 def _start(recording: Recording, stream: str) -> int | None:
@@ -184,37 +184,37 @@ def _register_topics(writer: Writer, recording: Recording, stream: _Stream) -> l
     """
     stored = recording.columns(stream.name)
     tables = stored.batches() if stream.ordered else iter([recording.table(stream.name)])
-    head = next(tables, stored.schema.empty_table())
-    first = stream.topics(head)
-    blocks = _share_values(itertools.chain([first], map(stream.topics, tables)), len(first))
+    first_table = next(tables, stored.schema.empty_table())
+    first_topics = stream.topics(first_table)
+    blocks = _share_values(itertools.chain([first_topics], map(stream.topics, tables)), len(first_topics))
     channels = []
-    for topic in first:
+    for topic in first_topics:
         schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
         metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
         channels.append(writer.register_channel(topic.name, "cdr", schema, metadata))
     return [
-        _topic_messages(number, channel, mine)
-        for number, (channel, mine) in enumerate(zip(channels, blocks, strict=True))
+        _topic_messages(number, channel, topic_blocks)
+        for number, (channel, topic_blocks) in enumerate(zip(channels, blocks, strict=True))
     ]
 
 
 def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
     """Return iterators over the same values, each buffered until all have read it (itertools.tee buffers 57 at a time)."""
-    waiting: list[deque[Any]] = [deque() for _ in range(readers)]
+    queues: list[deque[Any]] = [deque() for _ in range(readers)]
 
-    def read(mine: deque[Any]) -> Iterator[Any]:
+    def read(own_queue: deque[Any]) -> Iterator[Any]:
         while True:
-            if not mine:
+            if not own_queue:
                 try:
                     value = next(values)
                 except StopIteration:
                     return
-                for queue in waiting:
+                for queue in queues:
                     queue.append(value)
                 del value
-            yield mine.popleft()
+            yield own_queue.popleft()
 
-    return [read(mine) for mine in waiting]
+    return [read(own_queue) for own_queue in queues]
 
 
 def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
@@ -236,7 +236,7 @@ def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]
 
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
-    """Yield what is lost when a stream is written as messages: columns without a message type, missing values."""
+    """Yield what messages cannot represent of a stream: columns without a message type, and missing values."""
     import pyarrow as pa
 
     from tacpipe.exports import ros
@@ -246,6 +246,6 @@ def _losses(stream: str, table: Columns) -> Iterator[Loss]:
         if str(field.type) not in ros.TYPES:
             yield Loss(f"messages have no type for {field.type}", stream, field.name)
         elif column.null_count:
-            value: Any = "NaN" if pa.types.is_floating(field.type) else 0
-            value = "empty" if pa.types.is_string(field.type) or pa.types.is_binary(field.type) else value
-            yield Loss(f"missing values are written as {value}", stream, field.name)
+            filler: Any = "NaN" if pa.types.is_floating(field.type) else 0
+            filler = "empty" if pa.types.is_string(field.type) or pa.types.is_binary(field.type) else filler
+            yield Loss(f"missing values are written as {filler}", stream, field.name)

@@ -35,15 +35,15 @@ class Pictures:
         from tacpipe.exports import ros
 
         first, self._stop = self._stop, self._stop + table.num_rows
-        block = list(self._before(self._stop)) if table.num_rows else []
+        block = list(self._frames_before(self._stop)) if table.num_rows else []
         t_ns = table.column(TIME).to_numpy()[[row - first for row, _ in block]]
         content = ros.Texts([data for _, data in block])
         if self.is_video:
             return ros.derived_topic(stream, "video", VIDEO, t_ns, [content, ros.text_part(PLAYED[self._format.codec])])
         return ros.derived_topic(stream, "image", IMAGE, t_ns, [ros.text_part("jpeg"), content])
 
-    def _before(self, stop: int) -> Iterator[tuple[int, bytes]]:
-        """Yield row and content of the following frames up to the row ``stop``."""
+    def _frames_before(self, stop: int) -> Iterator[tuple[int, bytes]]:
+        """Yield row and content of the following frames before the row ``stop``."""
         if self._frames is None:
             batches = read_batches(self._columns)
             self._frames = self._packets(batches) if self.is_video else jpeg_images(self._format, batches)
@@ -55,6 +55,7 @@ class Pictures:
             yield frame
 
     def _packets(self, batches: Iterator[pa.Table]) -> Iterator[tuple[int, bytes]]:
+        """Yield row and content of each frame's packet, with parameter sets before key frames."""
         headers, size_bytes = parameter_sets(self._format)
         for row, columns in in_decode_order(self._format, batches):
             packet = columns[PACKET]
@@ -64,10 +65,10 @@ class Pictures:
 
 
 def parameter_sets(video_format: VideoFormat) -> tuple[bytes, int]:
-    """Return the parameter sets that a decoder needs before a key frame, and the number of bytes of a unit's size prefix.
+    """Return the parameter sets that a decoder needs before a key frame, and the width in bytes of a unit's size.
 
-    In files, H.264 and H.265 units have a size prefix (ISO/IEC 14496-15), but Foxglove expects start codes. The number
-    is 0 for packets with start codes and for other codecs.
+    In files, H.264 and H.265 units are preceded by their size (ISO/IEC 14496-15), but Foxglove expects start codes. The
+    width is 0 for packets with start codes and for other codecs.
     """
     extradata = video_format.extradata
     if video_format.codec not in ("h264", "hevc"):
@@ -99,8 +100,9 @@ def with_start_codes(packet: bytes, size_bytes: int) -> bytes:
 
 def _read_units(extradata: bytes, offset: int, count: int, units: list[bytes]) -> int:
     """Append ``count`` units, each preceded by its size in two bytes, to ``units``; return the offset after them."""
+    stop = offset
     for _ in range(count):
-        stop = offset + 2 + int.from_bytes(extradata[offset : offset + 2])
-        units.append(extradata[offset + 2 : stop])
-        offset = stop
-    return offset
+        start = stop + 2
+        stop = start + int.from_bytes(extradata[stop:start])
+        units.append(extradata[start:stop])
+    return stop

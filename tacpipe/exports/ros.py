@@ -93,25 +93,25 @@ def pack_messages(parts: Sequence[Part], rows: int) -> Iterator[bytes]:
 
 def _pack_fixed(parts: Sequence[Part], rows: int) -> AnyArray:
     """Return all messages as one array of bytes (message, byte)."""
-    places, position = [], 0
+    offsets, position = [], 0
     for part in parts:
-        align, size = _shape(part)
+        align, size = _alignment_and_size(part)
         position = _align_up(position, align)
-        places.append(position)
+        offsets.append(position)
         position += size
     messages = np.zeros((rows, len(HEADER) + position), dtype=np.uint8)
     messages[:, : len(HEADER)] = np.frombuffer(HEADER, np.uint8)
-    for part, place in zip(parts, places, strict=True):
-        begin = len(HEADER) + place
+    for part, offset in zip(parts, offsets, strict=True):
+        begin = len(HEADER) + offset
         if isinstance(part, Constant):
             messages[:, begin : begin + len(part.content)] = np.frombuffer(part.content, np.uint8)
         elif isinstance(part, Values):
-            wide = np.ascontiguousarray(part.values).view(np.uint8).reshape(rows, part.values.itemsize)
-            messages[:, begin : begin + part.values.itemsize] = wide
+            value_bytes = np.ascontiguousarray(part.values).view(np.uint8).reshape(rows, part.values.itemsize)
+            messages[:, begin : begin + part.values.itemsize] = value_bytes
     return messages
 
 
-def _shape(part: Part) -> tuple[int, int]:
+def _alignment_and_size(part: Part) -> tuple[int, int]:
     """Return the alignment and size of a part in bytes."""
     if isinstance(part, Constant):
         return part.align, len(part.content)
@@ -120,6 +120,7 @@ def _shape(part: Part) -> tuple[int, int]:
 
 
 def _pack_each(parts: Sequence[Part], rows: int) -> Iterator[bytes]:
+    """Yield the bytes of each message, packed one by one, for messages with texts."""
     for row in range(rows):
         message = bytearray()
         for part in parts:
@@ -128,19 +129,19 @@ def _pack_each(parts: Sequence[Part], rows: int) -> Iterator[bytes]:
                 content = value.encode() + b"\0" if isinstance(value, str) else value
                 message += bytes(_align_up(len(message), 4) - len(message)) + struct.pack("<I", len(content)) + content
                 continue
-            align, _ = _shape(part)
+            align, _ = _alignment_and_size(part)
             message += bytes(_align_up(len(message), align) - len(message))
             message += part.content if isinstance(part, Constant) else part.values[row].tobytes()
         yield HEADER + bytes(message)
 
 
-def _align_up(position: int, to: int) -> int:
-    """Return the first multiple of ``to`` at or after ``position``.
+def _align_up(position: int, multiple: int) -> int:
+    """Return the first multiple of ``multiple`` at or after ``position``.
 
     >>> _align_up(5, 4), _align_up(8, 8)
     (8, 8)
     """
-    return -(-position // to) * to
+    return -(-position // multiple) * multiple
 
 
 PACKAGE = "tacpipe_msgs"
@@ -269,9 +270,9 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
         image: list[Part] = [Texts([encodings[row] for row in rows]), Texts([values[row] for row in rows])]
         name = "image" if len(images) == 1 else f"image/{topic_part(column)}"
         add(name, "sensor_msgs/CompressedImage", t_ns[rows], image)
-    place, turn = vector_parts(table, "position", AXES), vector_parts(table, "orientation", COMPONENTS)
-    if place and turn:
-        add("pose", "geometry_msgs/PoseStamped", t_ns, [*place, *turn])
+    position, orientation = vector_parts(table, "position", AXES), vector_parts(table, "orientation", COMPONENTS)
+    if position and orientation:
+        add("pose", "geometry_msgs/PoseStamped", t_ns, [*position, *orientation])
     force, torque = vector_parts(table, "force", AXES), vector_parts(table, "torque", AXES)
     if force:
         add("wrench", "geometry_msgs/WrenchStamped", t_ns, [*force, *(torque or [Values(np.zeros(len(t_ns)))] * 3)])
@@ -360,9 +361,8 @@ def column_numbers(column: pa.ChunkedArray) -> AnyArray:
     """Return a column as little-endian numbers (time,); missing values are NaN, or 0 for integers."""
     import pyarrow as pa
 
-    if column.null_count:
-        column = column.fill_null(float("nan") if pa.types.is_floating(column.type) else pa.scalar(0).cast(column.type))
-    values: AnyArray = column.to_numpy()
+    filler = float("nan") if pa.types.is_floating(column.type) else pa.scalar(0).cast(column.type)
+    values: AnyArray = (column.fill_null(filler) if column.null_count else column).to_numpy()
     return values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
@@ -412,14 +412,14 @@ def _full_type(name: str) -> str:
 
 def _definition(name: str, definitions: Mapping[str, str]) -> str:
     """Return the definition of a message with those of all types in it, concatenated as in ROS."""
-    needed: list[str] = []
+    used_types: list[str] = []
     pending = [name]
     while pending:
         type_name = pending.pop(0)
-        if type_name not in needed:
-            needed.append(type_name)
+        if type_name not in used_types:
+            used_types.append(type_name)
             types = (line.split()[0].removesuffix("[]") for line in definitions[type_name].splitlines())
             pending += [kind for kind in types if "/" in kind]
     return definitions[name] + "".join(
-        f"{_SEPARATOR}MSG: {type_name}\n{definitions[type_name]}" for type_name in needed[1:]
+        f"{_SEPARATOR}MSG: {type_name}\n{definitions[type_name]}" for type_name in used_types[1:]
     )

@@ -194,11 +194,11 @@ class _ArrayWriter:
 
         self._waiting.append(values)
         self._rows += len(values)
-        whole = self._rows // self._chunk_rows * self._chunk_rows
-        if whole:
+        complete_rows = self._rows // self._chunk_rows * self._chunk_rows
+        if complete_rows:
             rows = np.concatenate(self._waiting)
-            self._write(rows[:whole])
-            self._waiting, self._rows = [rows[whole:]], len(rows) - whole
+            self._write(rows[:complete_rows])
+            self._waiting, self._rows = [rows[complete_rows:]], len(rows) - complete_rows
 
     def files(self) -> dict[str, Content]:
         """Write the last rows and return the files of the array by name."""
@@ -207,11 +207,12 @@ class _ArrayWriter:
         if self._rows:
             self._write(np.concatenate(self._waiting))
         self._scratch.check()
-        chunks = {name: functools.partial(self._scratch.piece, *place) for name, place in self._places.items()}
+        chunks = {name: functools.partial(self._scratch.piece, *span) for name, span in self._places.items()}
         files: dict[str, Content] = {**self._metadata, **chunks}
         return {f"{self._path}/{name}": content for name, content in files.items()}
 
     def _write(self, values: AnyArray) -> None:
+        """Write the next rows to the array, and move its complete chunks to the temporary file."""
         self._array[self._first_row : self._first_row + len(values)] = values
         self._first_row += len(values)
         for name in self._encoded.keys() - self._metadata.keys():

@@ -30,9 +30,9 @@ class Columns:
 
     def _set_schema(self, schema: pa.Schema) -> None:
         self.schema = schema
-        needed = [self.num_rows * _needed_bytes(field.type, self._block_bytes) for field in schema]
-        self._small = len(needed) > 0 and sum(needed) <= self._block_bytes
-        blocks = _blocks(schema.names, needed, self._block_bytes)
+        needed_bytes = [self.num_rows * _needed_bytes(field.type, self._block_bytes) for field in schema]
+        self._small = len(needed_bytes) > 0 and sum(needed_bytes) <= self._block_bytes
+        blocks = _blocks(schema.names, needed_bytes, self._block_bytes)
         self._blocks = {name: block for block in blocks for name in block}
         self._decoded = pa.table({})
         self._places: dict[str, int] = {}  # position of each decoded column
@@ -55,14 +55,14 @@ class Columns:
 
     def column(self, name: str) -> pa.ChunkedArray:
         """Return one column. Raises `KeyError` if it does not exist."""
-        place = self._places.get(name)
-        if place is None:
+        position = self._places.get(name)
+        if position is None:
             block = self._blocks[name]
             self.forget()  # frees memory for the next block
             self._decoded = self._file.read(block)
-            self._places = {column: place for place, column in enumerate(block)}
-            place = self._places[name]
-        return self._decoded.column(place)
+            self._places = {column: position for position, column in enumerate(block)}
+            position = self._places[name]
+        return self._decoded.column(position)
 
     def read(self, columns: Sequence[str]) -> pa.Table:
         """Return a table with these columns."""
@@ -98,14 +98,14 @@ def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -
     if columns.num_rows <= SOME_ROWS:
         return change_rows(columns.read(columns.column_names), 0)
 
-    def changed() -> Iterator[pa.RecordBatch]:
+    def changed_batches() -> Iterator[pa.RecordBatch]:
         release()  # frees the memory of earlier batches
         first = 0
         for table in columns.batches(rows=SOME_ROWS):
             yield from change_rows(table, first).combine_chunks().to_batches()
             first += table.num_rows
 
-    return pa.RecordBatchReader.from_batches(change_rows(columns.schema.empty_table(), 0).schema, changed())
+    return pa.RecordBatchReader.from_batches(change_rows(columns.schema.empty_table(), 0).schema, changed_batches())
 
 
 def release() -> None:
@@ -118,13 +118,13 @@ def release() -> None:
 def _blocks(names: Sequence[str], needed_bytes: Sequence[int], block_bytes: int) -> list[Sequence[str]]:
     """Return groups of neighbouring columns that need at most ``block_bytes`` together, or one column each."""
     blocks: list[list[str]] = []
-    room = 0
-    for name, needed in zip(names, needed_bytes, strict=True):
-        if not blocks or needed > room:
+    remaining_bytes = 0
+    for name, column_bytes in zip(names, needed_bytes, strict=True):
+        if not blocks or column_bytes > remaining_bytes:
             blocks.append([])
-            room = block_bytes
+            remaining_bytes = block_bytes
         blocks[-1].append(name)
-        room -= needed
+        remaining_bytes -= column_bytes
     return list(blocks)
 
 

@@ -27,9 +27,9 @@ def load_yaml(content: str | bytes) -> Any:
 
     if len(content) > MAX_CHARACTERS:
         raise ValueError(f"it has {len(content)} characters, {MAX_CHARACTERS} are allowed")
-    fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    base_loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-    class Loader(fast):  # type: ignore[misc]
+    class Loader(base_loader):  # type: ignore[misc]
         """Reject a mapping with a repeated key, for which YAML's loaders use the last value."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
@@ -45,7 +45,7 @@ def load_yaml(content: str | bytes) -> Any:
             return super().construct_mapping(node, deep)
 
     try:
-        _refuse_large(yaml.parse(content, Loader=fast))
+        _refuse_large(yaml.parse(content, Loader=base_loader))
         return yaml.load(content, Loader=Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark

@@ -20,10 +20,10 @@ _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EX
 def write_whole(
     path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
 ) -> bool:
-    """Write ``content``, as bytes or blocks, to ``path`` through ``draft`` next to it; return False if ``exclusive`` lost.
+    """Write ``content``, as bytes or blocks, to ``path`` through the file ``draft`` next to it.
 
-    A reader of ``path`` sees either the previous content or all of ``content``. Missing folders are created. ``mode``
-    is reduced by the umask.
+    A reader of ``path`` sees either the previous content or all of ``content``. With ``exclusive``, an existing file
+    stays and the result is False. Missing folders are created. ``mode`` is reduced by the umask.
     """
     try:
         _write_synced(draft, content, mode)
@@ -34,7 +34,10 @@ def write_whole(
 
 
 def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
-    """Rename a complete draft to ``path``, creating its folder if necessary; return False if ``exclusive`` lost."""
+    """Rename a complete draft to ``path``, creating its folder if necessary.
+
+    With ``exclusive``, an existing file stays and the result is False.
+    """
     try:
         return _move(draft, path, exclusive)
     except FileNotFoundError:
@@ -60,11 +63,12 @@ def sync_folder(path: str) -> None:
 
 def sync_folders(path: str, top: str) -> None:
     """Call `sync_folder` for a folder and its parents up to ``top``, because each may be new."""
+    folder = path
     while True:
-        sync_folder(path)
-        if path == top or len(path) <= len(top):
+        sync_folder(folder)
+        if folder == top or len(folder) <= len(top):
             return
-        path = os.path.dirname(path)  # noqa: PTH120
+        folder = os.path.dirname(folder)  # noqa: PTH120
 
 
 def listed(folder: Path, pattern: str = "*") -> list[Path]:
@@ -101,29 +105,29 @@ def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[
     visited: set[str] = set()
     pending = [os.fspath(source)]
     while pending:
-        place = pending.pop()
-        real = os.path.realpath(place)
-        if real in visited:
+        folder = pending.pop()
+        real_path = os.path.realpath(folder)
+        if real_path in visited:
             continue
-        visited.add(real)
+        visited.add(real_path)
         try:
-            folders, files = _contents(place, links)
+            folders, files = _contents(folder, links)
         except FileNotFoundError:
             continue
         except OSError as error:
             raise StorageError(
-                f"{error.filename or place} cannot be listed: {error.strerror or error}. What it holds would be left out: "
+                f"{error.filename or folder} cannot be listed: {error.strerror or error}. What it holds would be left out: "
                 f"make it readable, or take it away, and run the same command again."
             ) from error
-        yield place, folders, files
-        pending += [f"{place.rstrip('/')}/{name}" for name in reversed(folders)]
+        yield folder, folders, files
+        pending += [f"{folder.rstrip('/')}/{name}" for name in reversed(folders)]
 
 
-def _contents(place: str, links: bool) -> tuple[list[str], list[str]]:
-    """Return the sorted names of the subfolders and of all other entries in a folder."""
+def _contents(folder: str, links: bool) -> tuple[list[str], list[str]]:
+    """Return the sorted names of the subfolders of a folder, and those of its other entries."""
     folders: list[str] = []
     files: list[str] = []
-    with os.scandir(place) as entries:
+    with os.scandir(folder) as entries:
         for entry in entries:
             (folders if _is_folder(entry, links) else files).append(entry.name)
     return sorted(folders), sorted(files)
@@ -166,7 +170,7 @@ def may_not_write(error: StorageError) -> bool:
 
 
 def sentence(root: Path | str, error: OSError) -> StorageError:
-    """Return a sentence about a file system error below the store ``root``."""
+    """Return an error with a sentence about a file system error below the store ``root``."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StorageError(
             f"The disk under {root} is full; nothing was half written. Free some space (`tacpipe store gc --dry-run` "
@@ -209,6 +213,7 @@ def describe(error: OSError) -> str:
 
 
 def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> None:
+    """Write ``content`` to a new file and sync it; its folder is created if necessary."""
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     except FileNotFoundError:
@@ -223,6 +228,7 @@ def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> Non
 
 
 def _move(draft: str, path: str, exclusive: bool) -> bool:
+    """Rename a draft to ``path``. With ``exclusive``, an existing file stays and the result is False."""
     if not exclusive:
         os.replace(draft, path)  # noqa: PTH105
         return True

@@ -34,8 +34,11 @@ class _WithinError(Exception):
     """A value contains a `Written`, which `json` cannot encode."""
 
 
-def parts(value: Any) -> Iterator[bytes]:
-    """Yield `canonical` of a value in parts, including those of a `Written` in it. Raises the errors of `canonical`."""
+def canonical_parts(value: Any) -> Iterator[bytes]:
+    """Yield the canonical JSON of a value in parts, including those of each `Written` in it.
+
+    Raises the errors of `canonical`.
+    """
     written_by_name: dict[str, Written] = {}
 
     def placeholder(item: Any) -> str:
@@ -64,7 +67,7 @@ def canonical(value: Any) -> bytes:
     try:
         return _canonical(value, _PLAIN).encode()
     except _WithinError:
-        return b"".join(parts(value))
+        return b"".join(canonical_parts(value))
 
 
 def _refuse(item: Any) -> str:
@@ -81,6 +84,7 @@ _PLAIN = _encoder(_refuse)  # created once, because a dataset has a digest per r
 
 
 def _canonical(value: Any, encoder: json.JSONEncoder) -> str:
+    """Return a value as canonical JSON. Raises `TacpipeError` for values that JSON cannot represent."""
     try:
         text = encoder.encode(value)
         if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
@@ -102,7 +106,7 @@ def digest(value: Any) -> str:
         return hashlib.sha256(_canonical(value, _PLAIN).encode()).hexdigest()
     except _WithinError:
         hasher = hashlib.sha256()
-        for part in parts(value):
+        for part in canonical_parts(value):
             hasher.update(part)
         return hasher.hexdigest()
 
@@ -132,13 +136,13 @@ def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], s
     size and times are equal; a file written in the last `SETTLED_NS` is always read.
     """
     name = os.fspath(path)
-    before = _traits(name)
+    status = _traits(name)
     remembered = _remembered.get(name)
-    if remembered is not None and remembered[0] == before:
+    if remembered is not None and remembered[0] == status:
         return remembered[1]
     content_digest = (digest_of or file_digest)(path)
-    if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
-        _remembered[name] = before, content_digest
+    if status == _traits(name) and time.time_ns() - max(status[-2:]) > SETTLED_NS:
+        _remembered[name] = status, content_digest
     return content_digest
 
 

@@ -57,21 +57,21 @@ def _left_in_groups() -> Iterator[int]:
     lines = ["0::/", "0:memory:/"]  # the paths visible in a container
     with contextlib.suppress(OSError):
         lines += OWN_GROUPS.read_text().splitlines()
-    places: dict[Path, str] = {}
+    groups: dict[Path, str] = {}
     for line in lines:
         _, controllers, path = line.split(":", 2)
         version = "memory" if "memory" in controllers.split(",") else controllers
         if version in _VERSIONS:
-            place = GROUPS / version / path.strip("/")
-            places |= dict.fromkeys(
-                [place, *place.parents[: len(place.parts) - len((GROUPS / version).parts)]], version
+            group = GROUPS / version / path.strip("/")
+            groups |= dict.fromkeys(
+                [group, *group.parents[: len(group.parts) - len((GROUPS / version).parts)]], version
             )
-    for place, version in places.items():
+    for group, version in groups.items():
         limit_file, used, reclaimable = _VERSIONS[version]
         with contextlib.suppress(OSError, ValueError):  # "max" if there is no limit
-            group_bytes = int((place / limit_file).read_text()) - int((place / used).read_text())
+            group_bytes = int((group / limit_file).read_text()) - int((group / used).read_text())
             with contextlib.suppress(OSError, ValueError):
-                counts = dict(line.split(maxsplit=1) for line in (place / "memory.stat").read_text().splitlines())
+                counts = dict(line.split(maxsplit=1) for line in (group / "memory.stat").read_text().splitlines())
                 group_bytes += int(counts.get(reclaimable, 0))
             yield group_bytes
 
@@ -99,6 +99,7 @@ def shortage(error: BaseException) -> ShortageError | None:
 
 
 def _is_shortage(error: BaseException) -> bool:
+    """Return whether an error is, or may be, caused by exhausted memory or threads."""
     if isinstance(error, MemoryError) or (isinstance(error, SystemError) and scarce()):
         return True
     if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EAGAIN):
@@ -112,6 +113,7 @@ def _is_shortage(error: BaseException) -> bool:
 
 
 def _shortage_error(need: str) -> ShortageError:
+    """Return the error for a command that lacks the memory or threads described by ``need``."""
     limit = (
         f", of the {_megabytes(resource.getrlimit(resource.RLIMIT_AS)[0])} that `ulimit -v` allows" if limited() else ""
     )
@@ -218,10 +220,6 @@ def readable_size(count: int) -> str:
     >>> readable_size(2_500_000_000), readable_size(10)
     ('2.5 GB', '0.00001 MB')
     """
-    return (
-        f"{count / 1e9:,.1f} GB"
-        if count >= 1e8
-        else f"{count / 1e6:g} MB"
-        if count >= 1000
-        else f"{count / 1e6:.5f} MB"
-    )
+    if count >= 1e8:
+        return f"{count / 1e9:,.1f} GB"
+    return f"{count / 1e6:g} MB" if count >= 1000 else f"{count / 1e6:.5f} MB"

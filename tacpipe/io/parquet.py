@@ -65,30 +65,31 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     columns are stored. One row group of batches is spilled to disk (`tacpipe.io.row_groups`), or kept in memory if
     there are encoded frames.
     """
-    rows = row_groups.rows_in_groups(source, ROW_GROUP_ROWS, GROUP_BYTES)
-    head = rows.head()
-    many_repeats = _repeated_share(head, rows.release) > REPEATED_SHARE
+    row_groups_source = row_groups.rows_in_groups(source, ROW_GROUP_ROWS, GROUP_BYTES)
+    first_rows = row_groups_source.head()
+    many_repeats = _repeated_share(first_rows, row_groups_source.release) > REPEATED_SHARE
     encoding, compression_level = {}, {}
     compression = dict.fromkeys(source.schema.names, "zstd")
     value_bytes = max(
-        [_mean_bytes(head.column(field.name)) for field in source.schema if row_groups.holds_bytes(field)], default=0
+        [_mean_bytes(first_rows.column(field.name)) for field in source.schema if row_groups.holds_bytes(field)],
+        default=0,
     )
     for field in source.schema:
-        if row_groups.holds_bytes(field) and _compressed_already(head.column(field.name)):
+        if row_groups.holds_bytes(field) and _is_incompressible(first_rows.column(field.name)):
             compression[field.name] = "none"
-        delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not many_repeats)
-        compression_level[field.name] = ZSTD_LEVEL if delta or not many_repeats else ZSTD_LEVEL_REPEATED
+        is_delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not many_repeats)
+        compression_level[field.name] = ZSTD_LEVEL if is_delta or not many_repeats else ZSTD_LEVEL_REPEATED
         if pa.types.is_floating(field.type):
             encoding[field.name] = "BYTE_STREAM_SPLIT"
-        elif delta:
+        elif is_delta:
             encoding[field.name] = "DELTA_BINARY_PACKED"
         elif not pa.types.is_boolean(field.type):
             encoding[field.name] = "PLAIN"
-    bare = pa.schema([pa.field(field.name, field.type) for field in source.schema])
-    del head
+    bare_schema = pa.schema([pa.field(field.name, field.type) for field in source.schema])
+    del first_rows
     with pq.ParquetWriter(
-        rows.releasing(sink),
-        bare,
+        row_groups_source.releasing(sink),
+        bare_schema,
         use_dictionary=False,
         column_encoding=encoding,
         compression=compression,
@@ -99,8 +100,8 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
         store_schema=False,
     ) as writer:
         count = 0
-        for group in rows.groups(max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1)))):
-            writer.write_table(_combine_chunks(group).cast(bare), row_group_size=max(1, group.num_rows))
+        for group in row_groups_source.groups(max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1)))):
+            writer.write_table(_combine_chunks(group).cast(bare_schema), row_group_size=max(1, group.num_rows))
             count += group.num_rows
         writer.add_key_value_metadata({_KEY: _fields_to_json(source.schema)})
     return count
@@ -126,7 +127,8 @@ def require_claims(
     """Raise `TacpipeError` if columns of an untrusted file declare more than may be read at once, or than exists.
 
     The limit is ``max_bytes``, by default the available memory, for the fraction ``share`` that is read at once, or
-    `memory.MAX_BLOCK_BYTES` for ``rows`` rows. Each text counts, also if several share a dictionary entry.
+    `memory.MAX_BLOCK_BYTES` if only ``rows`` rows are read at once. Each text counts, also if several share a
+    dictionary entry.
     """
     with regular.failing(path), regular.opened(path) as file:
         try:
@@ -151,6 +153,7 @@ def require_claims(
 
 
 def _require_size(path: Path, size: int, max_bytes: int | None) -> None:
+    """Raise `TacpipeError` if a file declares more than ``max_bytes``, by default the available memory."""
     if max_bytes is None:
         memory.require(size, str(path))
     elif size > max_bytes:
@@ -210,7 +213,10 @@ class ParquetTable:
         return pq.ParquetFile(self._source, buffer_size=1 << 16, page_checksum_verification=True)
 
     def _count(self, columns: Sequence[str] | None) -> tuple[int, int, int]:
-        """Return the result of `Claims.count`."""
+        """Return total size, size of the largest page and number of ``columns``, as `Claims.count` does.
+
+        Raises `DamagedError` if the file is damaged.
+        """
         content = memoryview(self._content).cast("B") if isinstance(self._content, pa.Buffer) else self._content
         try:
             if self._claims is None:
@@ -225,7 +231,10 @@ class ParquetTable:
         return int(self._file.metadata.num_rows)
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the table, or only ``columns`` of it, with field metadata."""
+        """Return the table, or only ``columns`` of it, with field metadata.
+
+        Raises `DamagedError` if the file is damaged, and `ShortageError` if the table does not fit in memory.
+        """
         total, largest, _ = self._count(columns)
         memory.require(total + largest, f"A Parquet file of {self._size} bytes", error=ShortageError)
         try:
@@ -235,10 +244,10 @@ class ParquetTable:
             raise _read_error(self._size, error) from error
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
-        """Yield tables of up to ``rows`` rows with field metadata, decoded on demand."""
+        """Yield tables of up to ``rows`` rows with field metadata, decoded on demand. Raises the errors of `read`."""
         total, page, count = self._count(columns)
-        at_once = total * min(rows, self.num_rows) // max(1, self.num_rows)
-        memory.require(at_once + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
+        batch_bytes = total * min(rows, self.num_rows) // max(1, self.num_rows)
+        memory.require(batch_bytes + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
         names = list(columns) if columns is not None else None
         try:
             for batch in self._open_file().iter_batches(rows, columns=names, use_threads=False):
@@ -304,10 +313,11 @@ def _read_error(size: int, error: Exception) -> TacpipeError:
 
 def _combine_chunks(group: pa.Table) -> pa.Table:
     """Return rows with texts and bytes in single chunks, because pages would otherwise end at chunk boundaries."""
-    for position, column in enumerate(group.columns):
-        if column.num_chunks > 1 and not pa.types.is_primitive(column.type):
-            group = group.set_column(position, group.schema.field(position), column.combine_chunks())
-    return group
+    columns = [
+        column.combine_chunks() if column.num_chunks > 1 and not pa.types.is_primitive(column.type) else column
+        for column in group.columns
+    ]
+    return pa.Table.from_arrays(columns, schema=group.schema) if columns else group
 
 
 def _mean_bytes(column: pa.ChunkedArray) -> int:
@@ -318,7 +328,7 @@ def _mean_bytes(column: pa.ChunkedArray) -> int:
     return int(((pc.sum(pc.binary_length(column)).as_py() or 0) + offsets + nulls) / max(count, 1))
 
 
-def _compressed_already(column: pa.ChunkedArray) -> bool:
+def _is_incompressible(column: pa.ChunkedArray) -> bool:
     """Return whether zstd would hardly compress the bytes, as for JPEG images."""
     content = bytearray()
     for value in itertools.chain.from_iterable(column.chunks):
@@ -362,6 +372,7 @@ def _fields_to_json(schema: pa.Schema) -> bytes:
 
 
 def _with_fields(schema: pa.Schema, names: Sequence[str], fields: dict[str, dict[str, list[int]]]) -> pa.Schema:
+    """Return a schema with the field metadata that `_fields_to_json` encoded; ``names`` are those of all columns."""
     metadata: dict[str, dict[str, str]] = {}
     for key, values in fields.items():
         for value, positions in values.items():
@@ -387,8 +398,9 @@ def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
     """
     tables_with_names = []
     for name, table in tables.items():
-        if "recording" not in table.column_names:
+        columns, column_names = table.columns, table.column_names
+        if "recording" not in column_names:
             names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([name]))
-            table = table.add_column(0, "recording", names)
-        tables_with_names.append(pa.Table.from_arrays(table.columns, names=table.column_names))
+            columns, column_names = [names, *columns], ["recording", *column_names]
+        tables_with_names.append(pa.Table.from_arrays(columns, names=column_names))
     return pa.concat_tables(tables_with_names, promote_options="default").unify_dictionaries()

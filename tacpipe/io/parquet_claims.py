@@ -87,32 +87,33 @@ class Claims:
 
         ``content`` is the file. If ``shared``, each dictionary entry counts once, as in the file.
         """
-        places = [
-            place
-            for place, leaf in enumerate(self._leaves)
+        positions = [
+            position
+            for position, leaf in enumerate(self._leaves)
             if columns is None or leaf.path in columns or leaf.path.partition(".")[0] in columns
         ]
-        for place in places:
-            if (place, shared) not in self._counted:
-                self._counted[place, shared] = self._count_column(content, place, shared=shared)
+        for position in positions:
+            if (position, shared) not in self._counted:
+                self._counted[position, shared] = self._count_column(content, position, shared=shared)
                 if isinstance(content, mmap.mmap):
                     content.madvise(mmap.MADV_DONTNEED)
-        counts = [self._counted[place, shared] for place in places]
-        return sum(total for total, _ in counts), max((largest for _, largest in counts), default=0), len(places)
+        counts = [self._counted[position, shared] for position in positions]
+        return sum(total for total, _ in counts), max((largest for _, largest in counts), default=0), len(positions)
 
-    def _count_column(self, content: Bytes, place: int, *, shared: bool) -> tuple[int, int]:
-        """Return the size of a column in memory and that of its largest page."""
-        leaf, total, largest = self._leaves[place], 0, 0
+    def _count_column(self, content: Bytes, position: int, *, shared: bool) -> tuple[int, int]:
+        """Return the size of a column in memory, and that of its largest page.
+
+        Raises `ValueError` if the file is damaged.
+        """
+        leaf, total, largest = self._leaves[position], 0, 0
         for chunks in self._groups:
-            if place >= len(chunks):
+            if position >= len(chunks):
                 raise ValueError(f"column {leaf.path!r:.60} is not in a group of rows")
-            chunk = chunks[place].get(3) or {}
+            chunk = chunks[position].get(3) or {}
             start, stop = _span(chunk, len(content), leaf.path)
-            only = _USUAL.match(content, start, stop)
-            if (
-                only is not None and only.end() + _varint(only[2]) == stop and leaf.kind in WIDTHS
-            ):  # most columns have one page
-                values, unpacked = _varint(only[4]), _varint(only[1])
+            only_page = _USUAL.match(content, start, stop)  # most columns have one page
+            if only_page is not None and only_page.end() + _varint(only_page[2]) == stop and leaf.kind in WIDTHS:
+                values, unpacked = _varint(only_page[4]), _varint(only_page[1])
                 if values == chunk.get(5) and values >= 0 and unpacked >= 0:
                     total, largest = total + values * WIDTHS[leaf.kind], max(largest, unpacked)
                     continue
@@ -127,10 +128,10 @@ class Claims:
 
 
 def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
-    """Return start and end of the pages of a column chunk."""
+    """Return start and end of the pages of a column chunk. Raises `ValueError` if they are outside of the file."""
     start = _expect_number(chunk.get(9))
-    words = chunk.get(11)  # offset of its dictionary, if it has one
-    start = min(start, words) if isinstance(words, int) and words > 0 else start
+    dictionary_start = chunk.get(11)  # offset of its dictionary, if it has one
+    start = min(start, dictionary_start) if isinstance(dictionary_start, int) and dictionary_start > 0 else start
     stop = start + _expect_number(chunk.get(7))
     if not 0 <= start <= stop <= end:
         raise ValueError(f"column {name!r:.60} lies at bytes {start} to {stop} of {end}")
@@ -138,26 +139,30 @@ def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
 
 
 def _texts(pages: Collection[PageHeader], *, shared: bool) -> int:
-    """Return the maximum size of texts; each text with a shared prefix or dictionary may be as long as the dictionary."""
-    words = max((page.unpacked for page in pages if page.kind == DICTIONARY), default=0)
-    total = words if shared else 0
+    """Return the maximum size of texts in memory.
+
+    Each text with a shared prefix or dictionary may be as long as the dictionary.
+    """
+    dictionary_bytes = max((page.unpacked for page in pages if page.kind == DICTIONARY), default=0)
+    total = dictionary_bytes if shared else 0
     for page in pages:
         if page.kind != DICTIONARY and shared and page.encoding in INDEXES:
             total += page.values * INDEX
         elif page.kind != DICTIONARY:
-            longest = 0 if page.encoding in (PLAIN, DELTA_LENGTH) else max(words, page.unpacked)
+            longest = 0 if page.encoding in (PLAIN, DELTA_LENGTH) else max(dictionary_bytes, page.unpacked)
             total += page.unpacked + page.values * (OFFSET + longest)
     return total
 
 
-def _pages(content: Bytes, place: int, stop: int) -> Iterator[PageHeader]:
-    while place < stop:
-        usual = _USUAL.match(content, place, stop)
+def _pages(content: Bytes, offset: int, stop: int) -> Iterator[PageHeader]:
+    """Yield the headers of the pages between two offsets. Raises `ValueError` if one is invalid."""
+    while offset < stop:
+        usual = _USUAL.match(content, offset, stop)
         if usual is not None:
             page = PageHeader(DATA, _varint(usual[1]), _varint(usual[2]), _varint(usual[4]), usual[5][0] >> 1)
-            place = usual.end()
+            offset = usual.end()
         else:
-            header, place = _struct(content, place, stop, 0)
+            header, offset = _struct(content, offset, stop, 0)
             inner: dict[int, Any] = next(
                 (header[field] for field in (5, 7, 8) if isinstance(header.get(field), dict)), {}
             )
@@ -168,9 +173,9 @@ def _pages(content: Bytes, place: int, stop: int) -> Iterator[PageHeader]:
                     for value in (header.get(1), header.get(2), header.get(3), inner.get(1, 0), encoding)
                 )
             )
-        if page.unpacked < 0 or page.size < 0 or page.values < 0 or place + page.size > stop:
-            raise ValueError(f"a page declares {page.size} bytes, {page.unpacked} unpacked, of {stop - place}")
-        place += page.size
+        if page.unpacked < 0 or page.size < 0 or page.values < 0 or offset + page.size > stop:
+            raise ValueError(f"a page declares {page.size} bytes, {page.unpacked} unpacked, of {stop - offset}")
+        offset += page.size
         yield page
 
 
@@ -192,77 +197,85 @@ def _varint(text: Bytes) -> int:
     return (number >> 1) ^ -(number & 1)
 
 
-def _struct(content: Bytes, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
-    """Return the integer and structure fields of a structure by number, and the structure's end."""
+def _struct(content: Bytes, offset: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
+    """Return the integer and structure fields of a structure by number, and the structure's end.
+
+    Raises `ValueError` if it is truncated or nested too deeply.
+    """
     fields: dict[int, Any] = {}
     number = 0
-    while place < stop:
-        head = content[place]
-        place += 1
-        if not head:
-            return fields, place
-        kind = head & 15
-        if head >> 4:
-            number += head >> 4
+    while offset < stop:
+        type_byte = content[offset]
+        offset += 1
+        if not type_byte:
+            return fields, offset
+        kind = type_byte & 15
+        if type_byte >> 4:
+            number += type_byte >> 4
         else:
-            number, place = _number(content, place, stop)
-        if 3 < kind < 7 and place < stop and content[place] < 128:  # a one-byte number, which is the most common
-            fields[number] = content[place] >> 1 ^ -(content[place] & 1)
-            place += 1
+            number, offset = _number(content, offset, stop)
+        if 3 < kind < 7 and offset < stop and content[offset] < 128:  # a one-byte number, which is the most common
+            fields[number] = content[offset] >> 1 ^ -(content[offset] & 1)
+            offset += 1
         else:
-            fields[number], place = _value(content, place, stop, kind, depth)
+            fields[number], offset = _value(content, offset, stop, kind, depth)
     raise ValueError("its footer or a page's header was cut off")
 
 
-def _value(content: Bytes, place: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(content: Bytes, offset: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
+    """Return a value of type ``kind`` at an offset, None if it is not needed, and its end.
+
+    Raises `ValueError` for an unknown type.
+    """
     if kind in (1, 2):  # true, false
-        return kind == 1, place
+        return kind == 1, offset
     if kind == 3:
-        return _byte(content, place, stop)
+        return _byte(content, offset, stop)
     if kind in (4, 5, 6):
-        return _number(content, place, stop)
+        return _number(content, offset, stop)
     if kind == 7:
-        return None, place + 8
+        return None, offset + 8
     if kind == 8:  # a text, whose length is not in zigzag encoding
-        length, place = _number(content, place, stop)
-        return None, place + (2 * length if length >= 0 else -2 * length - 1)
+        length, offset = _number(content, offset, stop)
+        return None, offset + (2 * length if length >= 0 else -2 * length - 1)
     if kind == 9 and depth < MAX_DEPTH:
-        return _list(content, place, stop, depth + 1)
+        return _list(content, offset, stop, depth + 1)
     if kind == 12 and depth < MAX_DEPTH:
-        return _struct(content, place, stop, depth + 1)
+        return _struct(content, offset, stop, depth + 1)
     raise ValueError("its footer or a page's header is none")
 
 
-def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any], int]:
-    head, place = _byte(content, place, stop)
-    count, kind = head >> 4, head & 15
+def _list(content: Bytes, offset: int, stop: int, depth: int) -> tuple[list[Any], int]:
+    """Return the values of a list at an offset, and its end. Raises `ValueError` if it is truncated."""
+    type_byte, offset = _byte(content, offset, stop)
+    count, kind = type_byte >> 4, type_byte & 15
     if count == 15:
-        length, place = _number(content, place, stop)
+        length, offset = _number(content, offset, stop)
         count = 2 * length if length >= 0 else -2 * length - 1
     values: list[Any] = []
     for _ in range(count):
-        usual = _read_common_form(content, place, stop) if kind == 12 else None
+        usual = _read_common_form(content, offset, stop) if kind == 12 else None
         if usual is not None:
             values.append(usual[0])
-            place = usual[1]
+            offset = usual[1]
             continue
-        value, place = _byte(content, place, stop) if kind in (1, 2) else _value(content, place, stop, kind, depth)
-        if place > stop:
+        value, offset = _byte(content, offset, stop) if kind in (1, 2) else _value(content, offset, stop, kind, depth)
+        if offset > stop:
             raise ValueError("its footer or a page's header was cut off")
         values.append(value)
-    return values, place
+    return values, offset
 
 
-def _read_common_form(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:
+def _read_common_form(content: Bytes, offset: int, stop: int) -> tuple[dict[int, Any], int] | None:
     """Return the needed fields and the end of a footer structure in the common form, or None for other forms."""
-    first = content[place] if place < stop else 0
-    if first == _CHUNK and (chunk := _USUAL_CHUNK.match(content, place, stop)) and len(chunk[2]) == chunk[1][0]:
+    first_byte = content[offset] if offset < stop else 0
+    if first_byte == _CHUNK and (chunk := _USUAL_CHUNK.match(content, offset, stop)) and len(chunk[2]) == chunk[1][0]:
         return {3: {5: _varint(chunk[3]), 7: _varint(chunk[5]), 9: _varint(chunk[6])}}, chunk.end()
-    if first == _ELEMENT and (name := _USUAL_NAME.match(content, place, stop)):
+    if first_byte == _ELEMENT and (name := _USUAL_NAME.match(content, offset, stop)):
         kind = _USUAL_KIND.match(content, name.end() + name[1][0], stop)
         return None if kind is None else ({}, kind.end())
-    if first == _ORDER and content[place : min(place + 3, stop)] == b"\x1c\x00\x00":
-        return {}, place + 3
+    if first_byte == _ORDER and content[offset : min(offset + 3, stop)] == b"\x1c\x00\x00":
+        return {}, offset + 3
     return None
 
 
@@ -272,10 +285,11 @@ def _byte(content: Bytes, place: int, stop: int) -> tuple[int, int]:
     return content[place], place + 1
 
 
-def _number(content: Bytes, place: int, stop: int) -> tuple[int, int]:
-    end = place
+def _number(content: Bytes, offset: int, stop: int) -> tuple[int, int]:
+    """Return the number at an offset, and its end. Raises `ValueError` if it is truncated."""
+    end = offset
     while end < stop and content[end] & 128:
         end += 1
     if end >= stop:
         raise ValueError("its footer or a page's header was cut off")
-    return _varint(content[place : end + 1]), end + 1
+    return _varint(content[offset : end + 1]), end + 1

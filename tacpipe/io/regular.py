@@ -192,7 +192,7 @@ class naming:  # noqa: N801  (a context manager that is entered once per file; a
 def require(path: Path | str, mode: int) -> None:
     """Raise `IrregularError` if ``mode`` of `os.stat` is not that of a regular file."""
     if not stat.S_ISREG(mode):
-        kind = next((name for is_one, name in KINDS if is_one(mode)), "something else")
+        kind = next((name for matches, name in KINDS if matches(mode)), "something else")
         raise IrregularError(
             f"{path} is {kind}, not a file that holds data. Put the file in its place, or leave it out."
         )
@@ -216,6 +216,7 @@ def _open(path: Path | str, *, follow: bool) -> tuple[int, int]:
 
 
 def _expect_size(path: Path | str, size: int, max_bytes: int | None, *, in_memory: bool = True) -> None:
+    """Raise `IrregularError` if a file is larger than ``max_bytes``, `StorageError` if it does not fit in memory."""
     if max_bytes is not None and size > max_bytes:
         raise IrregularError(
             f"{path} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged or forged. Remove it."
@@ -225,10 +226,13 @@ def _expect_size(path: Path | str, size: int, max_bytes: int | None, *, in_memor
 
 
 def _read_remaining(path: Path | str, handle: int, data: bytes, max_bytes: int | None) -> bytes:
-    """Return the content of a file that is longer than one read, or that grows or shrinks while it is read."""
-    buffer = io.BytesIO()
-    while data:
-        buffer.write(data)
+    """Return the content of a file that is longer than ``data``, which was read first, or changes while it is read.
+
+    Raises the errors of `_expect_size`.
+    """
+    buffer, block = io.BytesIO(), data
+    while block:
+        buffer.write(block)
         _expect_size(path, buffer.tell(), max_bytes)
-        data = os.read(handle, 16 * BLOCK_BYTES)
+        block = os.read(handle, 16 * BLOCK_BYTES)
     return buffer.getvalue()

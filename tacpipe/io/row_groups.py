@@ -30,8 +30,8 @@ def rows_in_groups(
 
     A group contains at most about ``group_bytes`` of encoded frames.
     """
-    framed = any(holds_bytes(field) for field in source.schema)
-    if framed or isinstance(source, pa.Table):
+    has_frames = any(holds_bytes(field) for field in source.schema)
+    if has_frames or isinstance(source, pa.Table):
         return RowsInMemory(source, max_rows, group_bytes)
     return SpilledRows(source, max_rows)
 
@@ -66,11 +66,11 @@ class RowsInMemory:
             max_frame_bytes = self._group_bytes + FRAME_OVERHEAD * self._next.num_rows
             if any(self._next.column(name).nbytes > max_frame_bytes for name in frames):
                 break
-        head = self._first(self._max_rows)
+        first_rows = self._first(self._max_rows)
         for name in frames:
-            ends = np.cumsum(pc.binary_length(head.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
-            head = head.slice(0, max(1, int(np.searchsorted(ends, self._group_bytes, side="right"))))
-        return head
+            ends = np.cumsum(pc.binary_length(first_rows.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
+            first_rows = first_rows.slice(0, max(1, int(np.searchsorted(ends, self._group_bytes, side="right"))))
+        return first_rows
 
     def groups(self, rows: int) -> Iterator[pa.Table]:
         """Yield tables of ``rows`` rows, the last with the remainder; one empty table if there are no rows."""
@@ -88,14 +88,14 @@ class RowsInMemory:
 
     def _fill(self, rows: int) -> bool:
         """Buffer ``rows`` rows, or all remaining ones; return whether there are enough."""
-        waiting, count = [self._next], int(self._next.num_rows)
+        tables, count = [self._next], int(self._next.num_rows)
         for table in self._following if count < rows else ():
-            waiting.append(table)
+            tables.append(table)
             count += table.num_rows
             if count >= rows:
                 break
-        if len(waiting) > 1:
-            self._next = pa.concat_tables(waiting)
+        if len(tables) > 1:
+            self._next = pa.concat_tables(tables)
         return count >= rows
 
 
@@ -174,16 +174,17 @@ class _SpilledColumn:
 class _RowGroup:
     """A group with a maximum number of rows."""
 
-    def __init__(self, schema: pa.Schema, rows: int) -> None:
-        self.count = self._spilled = 0  # number of rows added, and how many of them are in the file
+    def __init__(self, schema: pa.Schema, max_rows: int) -> None:
+        """Create an empty group of at most ``rows`` rows."""
+        self.count = self._spilled = 0  # number of rows added, and how many of them are in the spill file
         self._schema = schema
-        self._waiting: list[pa.RecordBatch] = []  # batches in memory, until they are too large
+        self._waiting: list[pa.RecordBatch] = []  # batches held in memory until they grow too large
         self._bytes = 0  # size of the waiting batches
         self._columns = [_SpilledColumn(column_field, _width(column_field.type)) for column_field in schema]
-        place = 0
+        offset = 0
         for column in self._columns:
-            column.start, place = place, place + _whole_pages(column.width * rows)
-        self._size = place
+            column.start, offset = offset, offset + _whole_pages(column.width * max_rows)
+        self._size = offset
         self._file: Any = None
         self._mapped: mmap.mmap | None = None
 
@@ -203,6 +204,10 @@ class _RowGroup:
             self._spill()
 
     def _spill(self) -> None:
+        """Write the batches in memory to the spill file, which is created if needed.
+
+        Raises `StorageError` if the disk is full.
+        """
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  (closed by the line below)
@@ -217,10 +222,10 @@ class _RowGroup:
         self._waiting, self._bytes = [], 0
 
     def _write(self, column: _SpilledColumn, values: pa.Array, row: int) -> None:
+        """Write the values of a column, starting at the index ``row``, or keep a copy if they are not numbers."""
         if not column.width:
-            column.values.append(
-                values.take(pa.array(np.arange(len(values))))
-            )  # a copy, so that the batch can be freed
+            # a copy, so that the batch can be freed
+            column.values.append(values.take(pa.array(np.arange(len(values)))))
             return
         if values.null_count:
             column.valid.append((row, values.is_valid().to_numpy(zero_copy_only=False)))
@@ -237,6 +242,7 @@ class _RowGroup:
         return pa.Table.from_arrays([self._array(column, content) for column in self._columns], schema=self._schema)
 
     def _array(self, column: _SpilledColumn, content: pa.Buffer) -> pa.Array | pa.ChunkedArray:
+        """Return a column of the group from the mapped spill file."""
         kind = column.field.type
         if not column.width:
             return pa.chunked_array(column.values, kind)

@@ -88,18 +88,18 @@ class Spill:
 
 
 def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
-    """Write the unpacked content of the file at ``path`` to a temporary file.
+    """Write ``blocks``, the unpacked content of the file at ``path``, to a temporary file.
 
     Raises `StorageError` if it exceeds nine tenths of the free disk space, before the disk is full.
     """
     folder = tempfile.gettempdir()
-    free_bytes = room = int(shutil.disk_usage(folder).free * KEPT)
+    free_bytes = limit_bytes = int(shutil.disk_usage(folder).free * KEPT)
     for block in blocks:
         free_bytes -= len(block)
         if free_bytes < 0:
             raise StorageError(
-                f"{path} unpacks to more than the {room / 1e9:.3g} GB that {folder} has left. Set TMPDIR to a folder with "
-                f"more room; if its source is untrusted, do not use it."
+                f"{path} unpacks to more than the {limit_bytes / 1e9:.3g} GB that {folder} has left. Set TMPDIR to a folder "
+                f"with more room; if its source is untrusted, do not use it."
             )
         try:
             target.write(block)
@@ -146,25 +146,25 @@ def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: 
     >>> [one.column("t").to_pylist() for one in in_order(pieces, spill.read, "t")]
     [[1], [3, 4, 9], [12]]
     """
-    waiting: list[tuple[int, pa.Table]] = []  # position of the piece, and its remaining rows
-    for place, piece in sorted(enumerate(pieces), key=lambda numbers: (numbers[1].minima[order], numbers[0])):
-        yield from _rows_below(waiting, order, piece.minima[order])
-        waiting.append((place, sorted_by(read(piece), order)))
-    yield from _rows_below(waiting, order, None)
+    remaining: list[tuple[int, pa.Table]] = []  # position of the piece, and its remaining rows
+    for position, piece in sorted(enumerate(pieces), key=lambda numbers: (numbers[1].minima[order], numbers[0])):
+        yield from _rows_below(remaining, order, piece.minima[order])
+        remaining.append((position, sorted_by(read(piece), order)))
+    yield from _rows_below(remaining, order, None)
 
 
-def _rows_below(waiting: list[tuple[int, pa.Table]], order: str, limit: float | None) -> Iterator[pa.Table]:
-    """Yield the rows below ``limit`` as one table, and keep the others in ``waiting``."""
+def _rows_below(remaining: list[tuple[int, pa.Table]], order: str, limit: float | None) -> Iterator[pa.Table]:
+    """Yield the rows below ``limit``, or all for None, as one table sorted by ``order``; keep the others in ``waiting``."""
     ready: list[pa.Table] = []
-    later: list[tuple[int, pa.Table]] = []
-    for place, table in sorted(waiting, key=lambda entry: entry[0]):
+    not_ready: list[tuple[int, pa.Table]] = []
+    for position, table in sorted(remaining, key=lambda entry: entry[0]):
         values = table.column(order).to_numpy()
         end = table.num_rows if limit is None else int(np.searchsorted(values, limit, side="left"))
         if end:
             ready.append(table.slice(0, end))
         if end < table.num_rows:
-            later.append((place, table.slice(end)))
-    waiting[:] = later
+            not_ready.append((position, table.slice(end)))
+    remaining[:] = not_ready
     if ready:
         yield sorted_by(pa.concat_tables(ready), order)
 
@@ -185,7 +185,7 @@ class MappedArrays:
         self._used = 0  # used bytes of the last file
         self._read = 0  # bytes read since pages were released
 
-    def kept(self, values: AnyArray) -> AnyArray:
+    def keep(self, values: AnyArray) -> AnyArray:
         """Return a mapped copy of the values. Raises `StorageError` as `empty` does."""
         if values.nbytes <= self._in_memory:
             self._in_memory -= values.nbytes
@@ -198,8 +198,8 @@ class MappedArrays:
     def put_aside(self, column: AnyArray | pa.Array) -> AnyArray | pa.Array:
         """Return a column of the same values; one of texts, or with nulls, stays in memory. Raises as `empty`."""
         if isinstance(column, np.ndarray):
-            return self.kept(column)
-        return self.kept(from_arrow(column)) if is_numeric(column) else column
+            return self.keep(column)
+        return self.keep(from_arrow(column)) if is_numeric(column) else column
 
     @property
     def in_memory(self) -> bool:
@@ -213,12 +213,12 @@ class MappedArrays:
         if size <= self._in_memory:
             self._in_memory -= size
             return np.empty(shape, kind)
-        place = -(-self._used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
-        if not self._segments or place + size > len(self._segments[-1]):
+        offset = -(-self._used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+        if not self._segments or offset + size > len(self._segments[-1]):
             self._segments.append(_map_temporary_file(max(size, SEGMENT_BYTES)))
-            place = 0
-        self._used = place + size
-        return np.frombuffer(self._segments[-1], kind, int(np.prod(shape)), place).reshape(shape)
+            offset = 0
+        self._used = offset + size
+        return np.frombuffer(self._segments[-1], kind, int(np.prod(shape)), offset).reshape(shape)
 
     def read(self, size: int) -> None:
         """Note that about ``size`` bytes were read; beyond `MAX_READ_BYTES` their pages are released."""
@@ -234,7 +234,10 @@ class MappedArrays:
 
 
 def _map_temporary_file(size: int) -> mmap.mmap:
-    """Return a mapped temporary file of this size, with its disk space allocated."""
+    """Return a mapped temporary file of this size, with its disk space allocated.
+
+    Raises `StorageError` if the disk is full.
+    """
     try:
         with tempfile.TemporaryFile() as file:
             if hasattr(os, "posix_fallocate"):

@@ -49,6 +49,7 @@ class _Standard(io.FileIO):
         self.failure: OSError | None = None
 
     def write(self, content: Any) -> int:
+        """Write to the stream; after an error, redirect it to /dev/null and remember the error."""
         try:
             while (count := super().write(content)) is None:  # the terminal may have been made non-blocking
                 select.select([], [self], [])
@@ -78,6 +79,7 @@ def prepare() -> None:
 
 
 def _stream(handle: int, before: Any) -> io.TextIOWrapper:
+    """Return a text stream for a standard stream that replaces ``before``, which may be None."""
     if before is not None:
         before.flush()
     encoding = before.encoding if before is not None else "utf-8"
@@ -129,22 +131,22 @@ class TerminalTable:
     def lines(self, width: int) -> list[tuple[str, str]]:
         """Return the lines of the table with their styles, within ``width`` cells as far as `spare` allows."""
         columns = self._fitting_columns(width)
-        widths = {at: max(_cells(row[at]) for row in self._all_rows()) for at in columns}
+        widths = {position: max(_cells(row[position]) for row in self._all_rows()) for position in columns}
         indent = GAP if any(group.heading for group in self.groups) else ""
 
-        def line(cells: Sequence[str]) -> str:
+        def format_line(cells: Sequence[str]) -> str:
             padded = [
-                printable.padded(cells[at], widths[at])
-                if at in self.left
-                else " " * (widths[at] - _cells(cells[at])) + cells[at]
-                for at in columns
+                printable.padded(cells[position], widths[position])
+                if position in self.left
+                else " " * (widths[position] - _cells(cells[position])) + cells[position]
+                for position in columns
             ]
             return (indent + GAP.join(padded)).rstrip()
 
-        lines = [(line(self.heads), "bold")]
+        lines = [(format_line(self.heads), "bold")]
         for group in self.groups:
             lines += [(group.heading, "bold")] if group.heading else []
-            lines += [(line(row.cells), row.style) for row in group.rows]
+            lines += [(format_line(row.cells), row.style) for row in group.rows]
         caption = textwrap.wrap(printable.shown(self.caption), max(20, min(width, WIDTH)))
         return [*lines, *((text, "dim") for text in caption)]
 
@@ -158,12 +160,13 @@ class TerminalTable:
             yield from (row.cells for row in group.rows)
 
     def _fitting_columns(self, width: int) -> list[int]:
+        """Return the columns that fit in ``width`` cells, without as many of `spare` as necessary."""
         columns = list(range(len(self.heads)))
-        for at in self.spare:
-            needed = sum(max(_cells(row[at]) for row in self._all_rows()) + len(GAP) for at in columns)
+        for position in self.spare:
+            needed = sum(max(_cells(row[position]) for row in self._all_rows()) + len(GAP) for position in columns)
             if needed <= width:
                 break
-            columns.remove(at)
+            columns.remove(position)
         return columns
 
 

@@ -63,7 +63,7 @@ class _Program:
         self.restore: Callable[[], None] = lambda: None  # resets the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt` for the first request and end immediately for the second; the handler of all signals."""
+        """Handle a signal: raise `KeyboardInterrupt` for the first request, and end immediately for the second."""
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
@@ -193,6 +193,7 @@ class EndRequest:
         self._heard = _Requests()
 
     def __enter__(self) -> EndRequest:
+        """Install the handlers, so that requests set this object instead of ending the command."""
         self._before: dict[signal.Signals, Any] = {}
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
@@ -201,6 +202,7 @@ class EndRequest:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Restore the handlers."""
         _program.own_way = False
         if self.number == signal.SIGHUP:
             drop_closed_streams()  # processes at the other end of a pipe may have ended since
@@ -216,6 +218,7 @@ class EndRequest:
         self._requested.wait(timeout_s)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
+        """Note the first request; raise `KeyboardInterrupt` for the second."""
         if number == signal.SIGHUP:
             drop_closed_streams()
         if not self._heard.is_new_request() or (number == signal.SIGHUP and self._requested.is_set()):

@@ -84,7 +84,7 @@ def test_each_class_has_hidden_layers_of_its_own(frames: int, hidden: tuple[int,
     assert [network.hidden for network in autoencoder_fit.candidate_networks(frames, "", 0)] == [hidden]
 
 
-def test_a_row_depends_on_the_frames_before_it_and_not_across_a_break(tmp_path: Path) -> None:
+def test_a_row_depends_on_the_before_it_and_not_across_a_break(tmp_path: Path) -> None:
     fitted = fit(tmp_path, frames=3)
     values = WALKS["trial-1"]
     begins = np.arange(60) == 30

@@ -129,7 +129,7 @@ def test_the_blocks_of_slip_stand_where_the_protocol_says() -> None:
     assert body[index[4][1] :][:15].hex() == "010004000100020000484100004841"
 
 
-def test_frames_before_the_watch_for_slip_began_have_no_sample() -> None:
+def test_before_the_watch_for_slip_began_have_no_sample() -> None:
     plain, watched = Contactile(), Contactile(slip=True)
     before = made.pieces(plain, plain.encode(made.samples("contactile", plain, 4)))
     sent = made.samples("contactile", watched, 3)

@@ -74,7 +74,7 @@ class Levels:
 
     def put_aside(self, mapped: MappedArrays) -> Levels:
         """Return the same levels with their rows stored in ``mapped``."""
-        return Levels(mapped.kept(self.stored), self.rest_counts, self.dtype)
+        return Levels(mapped.keep(self.stored), self.rest_counts, self.dtype)
 
     def finite(self) -> Bools:
         """Return which rows (time,) contain only finite levels."""
@@ -166,10 +166,10 @@ class Track:
 
     def put_aside(self, mapped: MappedArrays) -> Track:
         """Return the same track with its rows stored in ``mapped``."""
-        tactile = self.tactile.put_aside(mapped) if isinstance(self.tactile, Levels) else mapped.kept(self.tactile)
+        tactile = self.tactile.put_aside(mapped) if isinstance(self.tactile, Levels) else mapped.keep(self.tactile)
         latent: AnyFloats | Levels
         if not isinstance(self.latent, Levels):
-            latent = mapped.kept(self.latent)
+            latent = mapped.keep(self.latent)
         elif isinstance(self.tactile, Levels) and self.latent.stored is self.tactile.stored:
             assert isinstance(tactile, Levels)
             latent = tactile.astype(self.latent.dtype)
@@ -177,7 +177,7 @@ class Track:
             latent = self.latent.put_aside(mapped)
         names = ("t_ns", "contact", "groups", "usable", "arm", "finger", "plan_velocity")
         arrays: dict[str, Any] = {
-            name: mapped.kept(getattr(self, name)) for name in names if getattr(self, name) is not None
+            name: mapped.keep(getattr(self, name)) for name in names if getattr(self, name) is not None
         }
         return replace(self, tactile=tactile, latent=latent, **arrays)
 

@@ -257,7 +257,7 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
 def _align_quaternions(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
     """Return a track whose quaternions have the sign of ``reference``; negated ones are stored in ``mapped``."""
     arm = tracks.align_quaternions(track.arm, reference)
-    return track if arm is track.arm else dataclasses.replace(track, arm=mapped.kept(arm))
+    return track if arm is track.arm else dataclasses.replace(track, arm=mapped.keep(arm))
 
 
 def _windows(part: Sequence[Track], params: Params, stride: int, device: str, mapped: MappedArrays) -> Rows:
