@@ -279,12 +279,17 @@ def table(
     *,
     words: bool = False,
 ) -> Table:
-    """Return a table of one group; ``kinds`` are the kinds of rows by index."""
-    return Table(title, heads, [Group([Row(row, (kinds or {}).get(at, "")) for at, row in enumerate(rows)])], words)
+    """Return a table of one group without a title; ``kinds`` are the kinds of rows by index, "" for the others.
+
+    ``words`` left-aligns the cells.
+    """
+    return Table(
+        title, heads, [Group([Row(row, (kinds or {}).get(index, "")) for index, row in enumerate(rows)])], words
+    )
 
 
 def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
-    """Return a list with a fold of the blocks that are not None, or an empty list if there are none."""
+    """Return a list with a fold of the blocks that are not empty; an empty list if only small print remains."""
     shown_blocks = [
         block for block in blocks if block is not None and not (isinstance(block, SmallPrint) and not block.text)
     ]
@@ -299,20 +304,20 @@ def notes(*texts: str) -> SmallPrint:
 
 
 def number(value: float, digits: int = 4) -> Cell:
-    """Return a number with this many digits, without an exponent unless it is tiny.
+    """Return a number with this many significant digits, thousands separated, "–" for NaN; tiny numbers are 0.
 
     >>> number(12345.6).text, number(-0.012345).text, number(float("nan")).text
     ('12,346', '−0.01235', '–')
     """
     if math.isnan(value):
         return Cell(NONE)
-    value = 0.0 if abs(value) < TINY else value
-    text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.{digits}g}"
-    return Cell(text.replace("-", "\N{MINUS SIGN}"), value=value)
+    rounded = 0.0 if abs(value) < TINY else value
+    text = f"{rounded:,.0f}" if abs(rounded) >= 1000 else f"{rounded:.{digits}g}"
+    return Cell(text.replace("-", "\N{MINUS SIGN}"), value=rounded)
 
 
 def fixed(value: float, digits: int) -> str:
-    """Return a number with this many decimals.
+    """Return a number with this many decimals, "–" for NaN.
 
     >>> fixed(0.05496, 4), fixed(float("nan"), 4)
     ('0.0550', '–')
@@ -321,19 +326,21 @@ def fixed(value: float, digits: int) -> str:
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """Return a number with its sign, with fewer decimals if it is large.
+    """Return a number with its sign, "–" for NaN; with at most one decimal from 10, and none from 100.
 
     >>> signed(0.5), signed(-123.4), signed(float("nan")), signed(2.0, 1)
     ('+0.500', '−123', '–', '+2.0')
     """
     if math.isnan(value):
         return NONE
-    digits = digits if abs(value) < 10 or digits < 2 else 1 if abs(value) < 100 else 0
-    return f"{round(value, digits) + 0.0:+,.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    shown_digits = digits
+    if abs(value) >= 10 and digits >= 2:
+        shown_digits = 1 if abs(value) < 100 else 0
+    return f"{round(value, shown_digits) + 0.0:+,.{shown_digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
-    """Return a signed number with its interval below, unless the interval is a point.
+    """Return a signed number with its interval below, unless the interval is a point or NaN; "–" if the mean is NaN.
 
     >>> interval(0.5, 0.25, 0.75)
     Cell(text='+0.500', below='+0.250 to +0.750', value=0.5, copy='')
@@ -346,7 +353,7 @@ def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
 
 
 def with_sd(mean: float, sd: float, digits: int = 4) -> Cell:
-    """Return mean ± standard deviation, without the latter if it is NaN.
+    """Return mean ± standard deviation, without the latter if it is NaN; "–" if the mean is NaN.
 
     >>> with_sd(0.05, 0.00123).text, with_sd(0.05, float("nan")).text
     ('0.0500 ± 0.0012', '0.0500')
@@ -357,16 +364,18 @@ def with_sd(mean: float, sd: float, digits: int = 4) -> Cell:
 
 
 def p_value(p: float) -> Cell:
-    """Return a p value with two digits.
+    """Return a p value with two digits, "< 0.0001" for a smaller one, "–" for NaN.
 
     >>> p_value(0.00016).text, p_value(1e-9).text, p_value(float("nan")).text
     ('0.00016', '< 0.0001', '–')
     """
-    return Cell(NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}", value=None if math.isnan(p) else p)
+    if math.isnan(p):
+        return Cell(NONE)
+    return Cell("< 0.0001" if p < 1e-4 else f"{p:.2g}", value=p)
 
 
 def form(name: str, text: str, published: bool) -> str:
-    """Return a caption or title, marked as in the form of the paper's table or figure if the data are the paper's.
+    """Return a caption: in the form of the paper's table or figure ``name`` if ``published``, else only ``text``.
 
     >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
     ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
@@ -375,7 +384,7 @@ def form(name: str, text: str, published: bool) -> str:
 
 
 def counted(count: int, plural: str) -> str:
-    """Return a count with its noun.
+    """Return a count with its noun, singular for 1; thousands are separated.
 
     >>> counted(1, "recordings"), counted(1200, "slides")
     ('1 recording', '1,200 slides')

@@ -74,15 +74,12 @@ class ReportResult(Generic[Config]):
 
     @property
     def epochs_of_paper(self) -> str:
-        """The epochs of a paper's network, such as "150 of 2,000 epochs", if they are fewer than the paper's.
-
-        Otherwise "".
-        """
-        tagged = {"architecture": str(self.config.get("architecture")), **self.given}
-        presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged))
-        epochs, printed = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
-        fewer = isinstance(epochs, int) and isinstance(printed, int) and 0 < epochs < printed
-        return f"{epochs:,} of {printed:,} epochs" if fewer else ""
+        """The epochs of a paper's network, such as "150 of 2,000 epochs", if fewer than the paper's; else ""."""
+        tagged_params = {"architecture": str(self.config.get("architecture")), **self.given}
+        presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged_params))
+        epochs, paper_epochs = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
+        are_fewer = isinstance(epochs, int) and isinstance(paper_epochs, int) and 0 < epochs < paper_epochs
+        return f"{epochs:,} of {paper_epochs:,} epochs" if are_fewer else ""
 
     @property
     def simulated(self) -> bool:
@@ -101,7 +98,7 @@ def read_json(result: Dataset, name: str) -> Any:
 
 
 def drop_duplicates(results: Sequence[Dataset]) -> list[Dataset]:
-    """Drop uncalibrated results that also exist calibrated on the same recordings.
+    """Return the results without uncalibrated ones that also exist calibrated on the same recordings.
 
     Both contain the same predictions, so one training would count twice.
     """
@@ -179,7 +176,7 @@ def loss_chart(
 
 
 def read_coverage(results: Sequence[Dataset]) -> pd.DataFrame | None:
-    """Return the rows of the coverage files of results, joined; None if no result is of a calibrated model."""
+    """Return the rows of the coverage files of results, joined, or None if no result is of a calibrated model."""
     import pandas as pd
 
     files = [result.files[COVERAGE_FILE] for result in results if COVERAGE_FILE in result.files]
@@ -195,7 +192,11 @@ def band_fold(
     *more: Block,
     about: str = "",
 ) -> list[Fold]:
-    """Return the section on bands between the outer ``levels`` in percent: charts of coverage, a table, and ``more``."""
+    """Return the fold on bands between the outer ``levels`` in percent: charts of coverage, a table, and ``more``.
+
+    ``explained`` is the note between the charts and the table, with ``heads`` and ``rows``; ``about`` follows the
+    title.
+    """
     title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
     return fold("Uncertainty", Charts(drawn), notes(explained), table(title, heads, rows), *more, about=about)
 
@@ -206,11 +207,9 @@ def without_gaps(values: Sequence[float | None]) -> list[float]:
     >>> without_gaps([None, 1]), without_gaps([None, None])
     ([nan, 1.0], [])
     """
-    return (
-        []
-        if all(value is None for value in values)
-        else [math.nan if value is None else float(value) for value in values]
-    )
+    if all(value is None for value in values):
+        return []
+    return [math.nan if value is None else float(value) for value in values]
 
 
 def curves_of_methods(methods: Sequence[Method], read: Callable[[Any], list[float]]) -> dict[str, list[list[float]]]:
@@ -253,13 +252,20 @@ class Context:
         return bool(self.runs) and all(run.published for run in self.runs)
 
     def winner(self, part: str) -> Method | None:
-        """Return the method with the best mean rank over the targets of a part; ties are broken by name."""
+        """Return the method with the best mean rank over the targets of a part, or None if none has a rank for all targets.
+
+        Ties are broken by name.
+        """
         ranks: dict[str, list[int]] = {}
         for method in self.parts[part]:
             for index, row in enumerate(method.models):
                 ranks.setdefault(row.name, []).append(index)
         target_count = max(map(len, ranks.values()), default=0)
-        mean_ranks = {name: float(np.mean(places)) for name, places in ranks.items() if len(places) == target_count}
+        mean_ranks = {
+            name: float(np.mean(method_ranks))
+            for name, method_ranks in ranks.items()
+            if len(method_ranks) == target_count
+        }
         best = min(mean_ranks, key=lambda name: (mean_ranks[name], name), default=None)
         return next((method for method in self.methods if method.name == best), None)
 
@@ -271,11 +277,11 @@ class Context:
 
 
 def median_run(method: Method, comparison: Comparison) -> ComparedRun:
-    """Return a method's run with the median score, or the lower of the two middle ones."""
+    """Return a method's run with the median score in a comparison, or the lower of the two middle ones."""
     measure, question = comparison.measure, comparison.question
     runs = method.of(question)
 
-    def place(run: ComparedRun) -> tuple[float, str]:
+    def by_score(run: ComparedRun) -> tuple[float, str]:
         return measure.score_of(run.questions[question].sums[MODEL].values()), str(run.seed)
 
-    return sorted(runs, key=place)[(len(runs) - 1) // 2]
+    return sorted(runs, key=by_score)[(len(runs) - 1) // 2]

@@ -22,7 +22,7 @@ def holds_cameras(dataset: Dataset) -> bool:
 
 
 def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset]) -> list[Fold]:
-    """Return a fold with frames of right and of wrong predictions; empty without cameras of these recordings.
+    """Return a list with the fold of frames of right and of wrong predictions; empty if no outcome's recording has a camera.
 
     A frame is in the middle of its recording, or of the recording's part in another of ``datasets``, such as a slide.
     """
@@ -31,10 +31,10 @@ def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset
     for dataset in datasets:
         for name, recording in dataset.recordings.items():
             (recordings if _cameras(recording) else parts)[name] = recording
-    seen = [outcome for outcome in outcomes if outcome.recording in recordings]
+    outcomes_with_frames = [outcome for outcome in outcomes if outcome.recording in recordings]
     blocks = []
     for title, is_right in (("Right", True), ("Wrong", False)):
-        chosen = _spread([outcome for outcome in seen if outcome.is_right == is_right])
+        chosen = _evenly_spaced([outcome for outcome in outcomes_with_frames if outcome.is_right == is_right])
         pictures = [
             picture
             for outcome in chosen
@@ -43,11 +43,16 @@ def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset
         blocks += [ImageRow(title, pictures)] if pictures else []
     if not blocks:
         return []
-    right = sum(outcome.is_right for outcome in seen)
+    right_count = sum(outcome.is_right for outcome in outcomes_with_frames)
     note = notes(
         f"Frames in the middle of what the model read, of at most {SHOWN} right and {SHOWN} wrong predictions."
     )
-    return fold("Frames of right and wrong predictions", *blocks, note, about=f"{right} of {len(seen)} are right")
+    return fold(
+        "Frames of right and wrong predictions",
+        *blocks,
+        note,
+        about=f"{right_count} of {len(outcomes_with_frames)} are right",
+    )
 
 
 def _cameras(recording: Recording) -> list[str]:
@@ -56,7 +61,7 @@ def _cameras(recording: Recording) -> list[str]:
     return [name for name in recording.streams if read_format(recording.columns(name)) is not None]
 
 
-def _spread(outcomes: Sequence[RecordingOutcome]) -> list[RecordingOutcome]:
+def _evenly_spaced(outcomes: Sequence[RecordingOutcome]) -> list[RecordingOutcome]:
     """Return at most `SHOWN` outcomes, evenly spaced by recording."""
     ordered = sorted(outcomes, key=lambda outcome: outcome.recording)
     if len(ordered) <= SHOWN:
@@ -65,7 +70,10 @@ def _spread(outcomes: Sequence[RecordingOutcome]) -> list[RecordingOutcome]:
 
 
 def _pictures(outcome: RecordingOutcome, recording: Recording, part: Recording | None) -> list[Picture]:
-    """Return a picture of each camera of a recording."""
+    """Return a picture of each camera of a recording, at the middle of its ``part`` if there is one.
+
+    Cameras without frames, and frames that cannot be decoded, are omitted.
+    """
     from tacpipe.video.decoding import read_frames
     from tacpipe.video.encoding import encode_images, jpeg_format
 
@@ -89,7 +97,7 @@ def _pictures(outcome: RecordingOutcome, recording: Recording, part: Recording |
 
 
 def _middle_ns(part: Recording, otherwise_ns: int) -> int:
-    """Return the middle of the times of a recording's first stream that has times."""
+    """Return the middle of the times of a recording's first stream that has times; ``otherwise_ns`` if none has."""
     for stream in part.streams:
         columns = part.columns(stream)
         if "t_ns" in columns.column_names and columns.num_rows:

@@ -28,13 +28,16 @@ COMMAND = re.compile(r"`([^`]+)`")
 
 
 def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
-    """Return the page as UTF-8; equal sections give equal bytes."""
+    """Return the page as UTF-8; equal sections give equal bytes.
+
+    Raises `MissingModuleError` if an extra is not installed.
+    """
     with extras.explain_missing("A report"):
         import jinja2
         from markupsafe import Markup
 
-        charts = any(_has_charts(section) for section in sections)
-        library = bundle() if charts else ""
+        has_charts = any(_has_charts(section) for section in sections)
+        library = bundle() if has_charts else ""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_template), autoescape=True, trim_blocks=True, lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
@@ -46,7 +49,7 @@ def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
         "library": Markup(library),
     }
     text = environment.get_template("page.html").render(
-        sections=sections, title=title, heading=heading, charts=charts, **parts
+        sections=sections, title=title, heading=heading, charts=has_charts, **parts
     )
     return f"{text}\n".encode()
 
@@ -66,7 +69,7 @@ def _template(name: str) -> str:
 
 
 def _spec_markup(spec: Any) -> Markup:
-    """Return a chart's specification as JSON that no text in it can terminate, with its data by column."""
+    """Return a chart's specification as packed JSON, with "<" escaped so that no text in it can end the script element."""
     from markupsafe import Markup
 
     text = json.dumps(_pack_spec(spec), sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
@@ -92,18 +95,14 @@ def _pack_spec(spec: Any) -> Any:
 
 
 def _pack_column(values: list[Any]) -> Any:
-    distinct = list(dict.fromkeys((type(value_key), value_key) for value_key in values))
+    """Return a column packed: numbers as they are, a constant once, other values as distinct values and their indices."""
+    distinct = list(dict.fromkeys((type(value), value) for value in values))
     if len(distinct) == 1 and len(values) > 1:
         return {"of": [values[0]], "at": 0}
-    if all(isinstance(value_key, int | float) or value_key is None for value_key in values) and not any(
-        isinstance(value_key, bool) for value_key in values
-    ):
+    if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values):
         return values
-    places = {value_key: index for index, value_key in enumerate(distinct)}
-    return {
-        "of": [value_key for _, value_key in distinct],
-        "at": [places[type(value_key), value_key] for value_key in values],
-    }
+    indices = {typed_value: index for index, typed_value in enumerate(distinct)}
+    return {"of": [value for _, value in distinct], "at": [indices[type(value), value] for value in values]}
 
 
 def _mark_commands(text: str) -> Markup:
@@ -114,34 +113,35 @@ def _mark_commands(text: str) -> Markup:
 
 
 def _has_charts(section: Section) -> bool:
-    """Return whether a section contains a chart."""
+    """Return whether a section contains a chart, also in nested folds."""
 
-    def inside(block: Block) -> bool:
-        return isinstance(block, Chart | Charts) or (isinstance(block, Fold) and any(map(inside, block.blocks)))
+    def has_chart(block: Block) -> bool:
+        return isinstance(block, Chart | Charts) or (isinstance(block, Fold) and any(map(has_chart, block.blocks)))
 
-    return section.chart is not None or any(map(inside, section.folds))
+    return section.chart is not None or any(map(has_chart, section.folds))
 
 
 def render(datasets: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
     """Return the page for results of ``tacpipe evaluate`` as UTF-8; equal results give equal bytes.
 
     The default ``title`` consists of the predicted quantities. Results are grouped by task in order of appearance, with
-    other datasets in the sections of tasks that can use them. Raises `TacpipeError` if no task can use a dataset, or if
-    there is no result.
+    other datasets in the sections of tasks that can use them. ``traces`` is the number of recordings that are drawn
+    completely. Raises `TacpipeError` if no task can use a dataset, or if there is no result.
     """
     with model_files.validated("the results"):
         return _render(datasets, title, traces)
 
 
 def _render(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
+    """Return the page as `render` does, without its check of result files. Raises `TacpipeError` as `render` does."""
     results = [dataset for dataset in datasets if "metrics.json" in dataset.files]
     extra_datasets = [dataset for dataset in datasets if "metrics.json" not in dataset.files]
     tasks = {name: report_on(name) for name in by_task(results)}
-    if not results or not all(_users(dataset, tasks) for dataset in extra_datasets):
+    if not results or not all(_tasks_using(dataset, tasks) for dataset in extra_datasets):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
     sections = []
     for name, task_results in by_task(results).items():
-        used_datasets = [dataset for dataset in extra_datasets if name in _users(dataset, tasks)]
+        used_datasets = [dataset for dataset in extra_datasets if name in _tasks_using(dataset, tasks)]
         sections.append(section(tasks[name], task_results, used_datasets, traces))
     titles = [section.title for section in sections]
     return page(
@@ -149,7 +149,7 @@ def _render(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
     )
 
 
-def _users(dataset: Dataset, tasks: Mapping[str, TaskReport]) -> list[str]:
+def _tasks_using(dataset: Dataset, tasks: Mapping[str, TaskReport]) -> list[str]:
     """Return the tasks whose section can use a dataset that is not a result."""
     with_outcomes = [name for name, task in tasks.items() if type(task).outcomes is not TaskReport.outcomes]
     if with_outcomes and holds_cameras(dataset):

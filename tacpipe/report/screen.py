@@ -23,39 +23,48 @@ CLAUSES = {
 
 
 def sentence(context: Context) -> tuple[str, str]:
-    """Return a sentence about the best method and its gain over the best baseline, and the verdict."""
+    """Return a sentence about the best method and its gain over the best baseline, and the verdict; two "" without methods.
+
+    The verdict is `headline.UNCLEAR` if those of parts or targets differ.
+    """
     clauses: list[str] = []
     verdicts: list[str] = []
-    last, answer = "", ("", "")
+    last_name, last_finding = "", ("", "")
     for part, compared in context.parts.items():
         method = context.winner(part)
         rows = [(comparison, row) for comparison in compared if (row := context.row(comparison, method)) is not None]
         if not rows or method is None:
             continue
         # parts of other splits or timelines are folded
-        name = "it" if method.name == last else method.name
-        last = method.name
+        name = "it" if method.name == last_name else method.name
+        last_name = method.name
         verdicts += [row.gain.verdict for _, row in rows]
-        alike = (verdicts[-1], rows[0][1].baseline)
-        if name == "it" and len(rows) == 1 and alike == answer and verdicts[-1]:
+        finding = (verdicts[-1], rows[0][1].baseline)
+        if name == "it" and len(rows) == 1 and finding == last_finding and verdicts[-1]:
             clauses.append(f"on {part} too: {_amount(*rows[0])}")
         else:
             clauses.append(_clause(part, name, rows))
-        answer = alike
+        last_finding = finding
     if not clauses:
         return "", ""
     text = "; ".join(clauses[:2])
-    return f"{text[:1].upper()}{text[1:]}.", verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
+    verdict = verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
+    return f"{text[:1].upper()}{text[1:]}.", verdict
 
 
 def first_chart(context: Context) -> Chart | None:
-    """Return the best methods and baselines with their intervals, one panel per question."""
+    """Return the best methods and baselines with their intervals, one panel per question, or None without methods.
+
+    With more than two questions, each panel has only the best method and the best baseline.
+    """
     dots: list[Dot] = []
     levels: dict[str, float] = {}
-    chosen = _questions(context)
-    has_panels = len(chosen) > 2
-    for comparison in chosen:
-        panel = (comparison.question.target if has_panels else comparison.question.where) if len(chosen) > 1 else ""
+    comparisons = _questions(context)
+    has_panels = len(comparisons) > 2
+    for comparison in comparisons:
+        panel = ""
+        if len(comparisons) > 1:
+            panel = comparison.question.target if has_panels else comparison.question.where
         methods = comparison.models[: 1 if has_panels else SHOWN]
         if has_panels and (winner := context.row(comparison, context.winner(comparison.question.part))):
             methods = [winner]
@@ -68,41 +77,48 @@ def first_chart(context: Context) -> Chart | None:
             dots += [Dot(row.name, score.mean, score.low, score.high, row.kind, panel)]
         if best:
             levels[panel] = best.score.mean
-    if not any(comparison.kind == "model" for comparison in dots):
+    if not any(dot.kind == "model" for dot in dots):
         return None
-    measure = chosen[0].measure
+    measure = comparisons[0].measure
     better = "right" if measure.rises else "left"
     caption = (
         "Blue: methods; grey: baselines; dashed: the best baseline; bars: 95 % intervals. Values further to the "
         f"{better} are better."
     )
-    part = f", {chosen[0].question.part}" if has_panels and chosen[0].question.part else ""
+    part = f", {comparisons[0].question.part}" if has_panels and comparisons[0].question.part else ""
     spec = charts.ranking(dots, measure.scored, level=levels, row=20 if has_panels else 24)
     return Chart(_capital(f"{measure.scored}{part}"), spec, caption)
 
 
 def first_table(context: Context) -> Table | None:
-    """Return one row per best method and the best baseline; with several targets, one row of the best method per target."""
+    """Return one row per best method and the best baseline, or None without methods.
+
+    With several targets, it has one row of the best method per target.
+    """
     parts = dict(list(context.parts.items())[:2])
     if not any(comparison.models for compared in parts.values() for comparison in compared):
         return None
     targets = list(dict.fromkeys(comparison.question.target for compared in parts.values() for comparison in compared))
     if len(targets) > 1:
         return _table_by_target(context, parts, targets)
-    firsts = [compared[0] for compared in parts.values()]
-    names = list(dict.fromkeys(row.name for comparison in firsts for row in _leaders(comparison)))[: MAX_ROWS - 2]
-    baselines = [row.name for first in firsts for row in [first.best_baseline] if row]
-    baselines += [row.name for first in firsts for row in first.of("baseline") if row.name == first.measure.reference]
+    first_comparisons = [compared[0] for compared in parts.values()]
+    names = list(dict.fromkeys(row.name for comparison in first_comparisons for row in _leaders(comparison)))[
+        : MAX_ROWS - 2
+    ]
+    baselines = [row.name for first in first_comparisons for row in [first.best_baseline] if row]
+    baselines += [
+        row.name for first in first_comparisons for row in first.of("baseline") if row.name == first.measure.reference
+    ]
     baselines = list(dict.fromkeys(baselines))
     baselines = baselines[: MAX_ROWS - len(names)]
-    single = len(firsts) == 1
+    single = len(first_comparisons) == 1
     heads, kinds = [""], dict[int, str]()
     rows: list[Sequence[str | Cell]] = []
-    for comparison in firsts:
+    for comparison in first_comparisons:
         heads += _heads(comparison, single)
     for name in [*names, *baselines]:
         cells: list[str | Cell] = [name]
-        for comparison in firsts:
+        for comparison in first_comparisons:
             row = next((row for row in comparison.rows if row.name == name), None)
             cells += _cells(comparison, row, single)
         if name in baselines:
@@ -110,7 +126,7 @@ def first_table(context: Context) -> Table | None:
         rows.append(cells)
     if names:
         kinds[0] = "best"
-    remaining = len({row.name for comparison in firsts for row in comparison.models}) - len(names)
+    remaining = len({row.name for comparison in first_comparisons for row in comparison.models}) - len(names)
     title = "Best methods and the best baseline" + (
         f"; {counted(remaining, 'more methods')} below" if remaining > 0 else ""
     )
@@ -118,6 +134,7 @@ def first_table(context: Context) -> Table | None:
 
 
 def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targets: Sequence[str]) -> Table:
+    """Return a table with a row per target: the best method of each part, the best baseline, and the gain."""
     heads = [""]
     for part, compared in parts.items():
         method = context.winner(part)
@@ -157,12 +174,13 @@ def _questions(context: Context) -> list[Comparison]:
 
 
 def _leaders(comparison: Comparison) -> list[ComparisonRow]:
-    """Return the best method of each family, then the others, the best first."""
-    firsts: dict[str, ComparisonRow] = {}
+    """Return the best method of each family, then the best of the others, in the order of the comparison."""
+    best_by_family: dict[str, ComparisonRow] = {}
     for row in comparison.models:
-        firsts.setdefault(row.family, row)
-    heads = list(firsts.values())[: MAX_ROWS - 2]
-    leading_names = {row.name for row in heads} | {row.name for row in comparison.models[: MAX_ROWS - 2 - len(heads)]}
+        best_by_family.setdefault(row.family, row)
+    best_rows = list(best_by_family.values())[: MAX_ROWS - 2]
+    leading_names = {row.name for row in best_rows}
+    leading_names |= {row.name for row in comparison.models[: MAX_ROWS - 2 - len(best_rows)]}
     next_rows = [row for row in comparison.models if row.name not in leading_names][
         : max(MAX_ROWS - 2 - len(leading_names), 0)
     ]
@@ -170,17 +188,19 @@ def _leaders(comparison: Comparison) -> list[ComparisonRow]:
 
 
 def _heads(comparison: Comparison, single: bool) -> list[str]:
+    """Return the heads of a comparison's columns in the first table; ``single`` is whether it is the table's only one."""
     measure = comparison.measure
     columns = list(measure.columns[-2:]) if single else [measure.columns[-1]]
-    place = "" if single or not comparison.question.part else f"{comparison.question.part}: "
+    prefix = "" if single or not comparison.question.part else f"{comparison.question.part}: "
     return [
-        *(f"{place}{name}" for name in columns),
-        f"{place}{measure.name} over baseline",
+        *(f"{prefix}{name}" for name in columns),
+        f"{prefix}{measure.name} over baseline",
         *(["n"] if single else []),
     ]
 
 
 def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> list[str | Cell]:
+    """Return the cells of a method or baseline below `_heads`; dashes if it has no ``row``."""
     if row is None:
         return [NONE] * len(_heads(comparison, single))
     values = row.values[-2:] if single else row.values[-1:]
@@ -190,27 +210,27 @@ def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> l
 
 
 def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, ComparisonRow]]) -> str:
-    place = f"on {part}, " if part else ""
+    """Return the clause of a sentence on the method ``name`` in a part: its verdict, or those of its targets."""
+    prefix = f"on {part}, " if part else ""
     if len(rows) == 1:
         comparison, row = rows[0]
-        return f"{place}{name} {_verb(comparison, row)}"
+        return f"{prefix}{name} {_verb(comparison, row)}"
     targets_by_verdict: dict[str, list[str]] = {}
     for comparison, row in rows:
         targets_by_verdict.setdefault(row.gain.verdict, []).append(comparison.question.target)
     counts = []
     for verdict in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
         if verdict in targets_by_verdict:
-            all_of = len(targets_by_verdict[verdict]) == len(rows)
-            targets = f"all {len(rows)} targets" if all_of else f"{listed(targets_by_verdict[verdict])}"
+            is_all = len(targets_by_verdict[verdict]) == len(rows)
+            targets = f"all {len(rows)} targets" if is_all else f"{listed(targets_by_verdict[verdict])}"
             counts.append(f"{CLAUSES[verdict]} the best baseline on {targets}")
     if not counts:
-        return (
-            f"{place}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
-        )
-    return f"{place}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
+        return f"{prefix}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
+    return f"{prefix}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
 
 
 def _verb(comparison: Comparison, row: ComparisonRow) -> str:
+    """Return what a sentence says of a method: whether it is better and by how much, or why there is no verdict."""
     size = counted(row.n, comparison.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def metrics_sentence(results: Sequence[Dataset]) -> str:
-    """Return the first headline of results as a sentence, or what is missing if there is none."""
+    """Return the first headline of results as a sentence, or why there is none."""
     for result in results:
         headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
         if headlines:
@@ -51,7 +51,7 @@ def metrics_sentence(results: Sequence[Dataset]) -> str:
 
 
 def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
-    """Return the folds of one result, the ``place``-th of ``count``."""
+    """Return the fold of one result, the ``place``-th of ``count``: its headlines, metrics and provenance."""
     config = context.read_json(result, "config.json")
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
@@ -62,7 +62,7 @@ def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
 
 
 def leaves(tree: JsonObject) -> dict[str, str]:
-    """Return nested values as text, by the names that lead to them.
+    """Return nested values as text by the names that lead to them; "–" for None.
 
     >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})
     {'model, accuracy, biotac': '0.5', 'classes': '[1, 2]', 'p': '–'}
@@ -93,25 +93,26 @@ PICKED = (
 
 
 def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequence[Dataset], traces: int) -> Section:
-    """Return the section for the results of one task and related datasets."""
+    """Return the section for the results of one task; ``extra_datasets`` are related ones that are not results.
+
+    ``traces`` is the number of recordings that are drawn completely.
+    """
     runs = task.read(results)
     methods = grouped(runs, task.usual)
-    compared = {id(result.dataset) for result in runs}
-    bare = [result for result in results if id(result) not in compared]
+    with_runs = {id(result.dataset) for result in runs}
+    bare = [result for result in results if id(result) not in with_runs]
     context = Context(task, methods, engine.comparisons(task, methods), extra_datasets, bare, traces, runs)
     sentence, verdict = task.sentence(context) or screen.sentence(context)
-    unread = [
-        result_fold for number, result in enumerate(bare, 1) for result_fold in metric_folds(result, number, len(bare))
-    ]
+    bare_folds = [fold for number, result in enumerate(bare, 1) for fold in metric_folds(result, number, len(bare))]
     folds = [
-        *everything(context),
+        *method_folds(context),
         *task.folds(context),
         *frames.frame_folds([outcome for run in runs[:1] for outcome in task.outcomes(run)], extra_datasets),
-        *recordings(context),
-        *every_run(context),
-        *unread,
-        *basis(context),
-        *source(context),
+        *recording_folds(context),
+        *run_folds(context),
+        *bare_folds,
+        *basis_folds(context),
+        *source_folds(context),
     ]
     simulated = context.simulated or any(is_simulated(result) for result in bare)
     if not runs and bare:
@@ -129,8 +130,8 @@ def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequen
     )
 
 
-def everything(context: Context) -> list[Fold]:
-    """Return tables of all methods by family, then baselines, oracles and controls, one table per question."""
+def method_folds(context: Context) -> list[Fold]:
+    """Return a fold with tables of all methods by family, then baselines, oracles and controls, one table per question."""
     tables = [_table(context, comparison) for comparison in context.comparisons]
     if not tables:
         return []
@@ -150,7 +151,7 @@ def everything(context: Context) -> list[Fold]:
 
 
 def headline_caption(measure: Measure) -> str:
-    """Return the meaning of a measure's columns."""
+    """Return the meaning of a measure's columns, as notes below a table."""
     skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
     points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
     return (
@@ -161,13 +162,14 @@ def headline_caption(measure: Measure) -> str:
 
 
 def _table(context: Context, comparison: Comparison) -> Table:
-    extra = context.task.columns(context, comparison)
+    """Return the table of a comparison: methods by family, folded, then the other kinds of predictors."""
+    task_columns = context.task.columns(context, comparison)
     families: dict[str, list[ComparisonRow]] = {}
     for row in comparison.models:
         families.setdefault(row.family, []).append(row)
     groups = [
         Group(
-            [_line(comparison, row, extra, "best" if row is comparison.best else "") for row in rows],
+            [_line(comparison, row, task_columns, "best" if row is comparison.best else "") for row in rows],
             folded=len(rows) > 1,
         )
         for rows in families.values()
@@ -175,7 +177,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
     for kind, title in KINDS.items():
         rows = comparison.of(kind)  # type: ignore[arg-type]
         if rows:
-            groups.append(Group([_line(comparison, row, extra, "quiet") for row in rows], title))
+            groups.append(Group([_line(comparison, row, task_columns, "quiet") for row in rows], title))
     score = [] if _is_score_column(comparison) else [comparison.measure.scored]
     heads = [
         "",
@@ -186,7 +188,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
         f"{comparison.measure.name} over the best baseline",
     ]
     counts = dict.fromkeys([comparison.measure.cluster, "recordings", "runs"])
-    heads += ["best baseline", "p", *(head for head, _ in extra), *counts]
+    heads += ["best baseline", "p", *(head for head, _ in task_columns), *counts]
     return Table(comparison.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
 
@@ -198,26 +200,30 @@ def _is_score_column(comparison: Comparison) -> bool:
 
 
 def _line(
-    comparison: Comparison, row: ComparisonRow, extra: Sequence[tuple[str, Callable[[ComparisonRow], Cell]]], kind: str
+    comparison: Comparison,
+    row: ComparisonRow,
+    task_columns: Sequence[tuple[str, Callable[[ComparisonRow], Cell]]],
+    kind: str,
 ) -> Line:
+    """Return the line of a method or baseline in `_table`; ``extra`` are further columns, (head, function of the row)."""
     score = row.score
-    ends = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
+    interval = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
     cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
     cells += [] if _is_score_column(comparison) else [number(score.mean)]
-    cells += [ends, number(row.spread, 3), screen.gain(comparison, row), row.baseline or NONE, p_value(row.p)]
-    cells += [make(row) for _, make in extra]
+    cells += [interval, number(row.spread, 3), screen.gain(comparison, row), row.baseline or NONE, p_value(row.p)]
+    cells += [make(row) for _, make in task_columns]
     counts = {comparison.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
     cells += [Cell(f"{count:,}", value=count) for count in counts.values()]
     return Line(cells, kind)
 
 
-def recordings(context: Context) -> list[Fold]:
-    """Return the best method's errors on each recording of each part, the worst first, with the command to view one."""
-    parts: list[blocks.Block] = []
+def recording_folds(context: Context) -> list[Fold]:
+    """Return a fold with the best method's errors on each recording, the worst first, with the command to view one."""
+    recording_blocks: list[blocks.Block] = []
     for comparison in context.comparisons:
         row = context.row(comparison, context.winner(comparison.question.part))
-        parts += _recording_table(comparison, row) if row else []
-    if not parts:
+        recording_blocks += _recording_table(comparison, row) if row else []
+    if not recording_blocks:
         return []
     command = SmallPrint(
         "To view a recording with its predictions, run `tacpipe view DATASET RECORDING --predictions RESULT`, "
@@ -225,41 +231,46 @@ def recordings(context: Context) -> list[Fold]:
         "command."
     )
     return [
-        Fold("Recordings", [command, *parts], "the worst recordings of the best method, with commands to view them")
+        Fold(
+            "Recordings",
+            [command, *recording_blocks],
+            "the worst recordings of the best method, with commands to view them",
+        )
     ]
 
 
 def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
+    """Return a chart of a method's gains over the baseline by recording, if there are enough, and a table of its errors."""
     measure, question = comparison.measure, comparison.question
     best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
-    mine = pairing.add_by_key((name, comparison) for (_, name), comparison in row.method.sums(question).items())
-    based_on = best.method.sums(question, best.predictor) if best else {}
-    baseline_sums = pairing.add_by_key((name, comparison) for (_, name), comparison in based_on.items())
-    names = sorted(mine)
-    errors, based = (
+    model_sums = pairing.add_by_key((name, sums) for (_, name), sums in row.method.sums(question).items())
+    sums_by_run = best.method.sums(question, best.predictor) if best else {}
+    baseline_sums = pairing.add_by_key((name, sums) for (_, name), sums in sums_by_run.items())
+    names = sorted(model_sums)
+    errors, baseline_errors = (
         np.array([float(measure.error(sums[name][None])[0]) if name in sums else np.nan for name in names])
-        for sums in (mine, baseline_sums)
+        for sums in (model_sums, baseline_sums)
     )
-    gains = np.asarray(measure.gain(errors, based), np.float64)
-    order = sorted(range(len(names)), key=lambda at: (np.isnan(errors[at]), -errors[at], names[at]))  # worst first
-    wrong = [at for at in order if errors[at] != 0]
+    gains = np.asarray(measure.gain(errors, baseline_errors), np.float64)
+    worst_first = sorted(range(len(names)), key=lambda index: (np.isnan(errors[index]), -errors[index], names[index]))
+    wrong = [index for index in worst_first if errors[index] != 0]
     digits = 1 if measure.name == "points" else 3
     rows: list[Sequence[str | Cell]] = []
-    for at in wrong[:RECORDINGS]:
-        name = names[at]
-        values = [number(value) for value in measure.values(mine[name])]
+    for index in wrong[:RECORDINGS]:
+        name, gain = names[index], float(gains[index])
+        values = [number(value) for value in measure.values(model_sums[name])]
         base = number(measure.values(baseline_sums[name])[0]) if name in baseline_sums else Cell(NONE)
-        gain = Cell(blocks.signed(float(gains[at]), digits), value=None if np.isnan(gains[at]) else float(gains[at]))
-        rows.append([Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, base, gain])
+        gain_cell = Cell(blocks.signed(gain, digits), value=None if np.isnan(gain) else gain)
+        rows.append([Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, base, gain_cell])
     parts: list[blocks.Block] = []
     defined = gains[~np.isnan(gains)]
     title = f"{question.where}: {row.name}"
     if len(defined) > 3 and measure.cluster == "recordings":
-        ranked = [at for at in np.argsort(-gains, kind="stable") if not np.isnan(gains[at])]
-        drawn = [ranked[at] for at in np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))]
+        ranked = [index for index in np.argsort(-gains, kind="stable") if not np.isnan(gains[index])]
+        ranks = np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))
         dots = [
-            {"x": float(at), "y": float(gains[name]), "name": row.name, "tip": names[name]}
-            for at, name in enumerate(drawn, 1)
+            {"x": float(place), "y": float(gains[index]), "name": row.name, "tip": names[index]}
+            for place, index in enumerate((ranked[rank] for rank in ranks), 1)
         ]
         quantity = f"{measure.name} over {row.baseline}"
         spec = charts.scatter(dots, "recordings, the best first", quantity, level=("", 0.0), legend=False, height=170)
@@ -267,45 +278,40 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
             Chart(f"{title}, better than {row.baseline} on {int((defined > 0).sum())} of {len(defined)}", spec)
         )
     about = f"the {RECORDINGS} worst of {len(names):,}" if len(wrong) > RECORDINGS else "the worst first"
-    right = f"; {len(names) - len(wrong):,} of {len(names):,} have no error" if len(wrong) < len(names) else ""
+    without_errors = f"; {len(names) - len(wrong):,} of {len(names):,} have no error" if len(wrong) < len(names) else ""
     baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
     heads = ["recording", *measure.columns, baseline_head, measure.name]
     if not rows:
         return [*parts, SmallPrint(f"{title}: none of the {len(names):,} has an error.")]
-    return [*parts, blocks.table(f"{title}, {about}{right}", heads, rows)]
+    return [*parts, blocks.table(f"{title}, {about}{without_errors}", heads, rows)]
 
 
-def every_run(context: Context) -> list[Fold]:
-    """Return a table with one row per run."""
+def run_folds(context: Context) -> list[Fold]:
+    """Return a fold with a table with one row per run."""
     rows: list[Sequence[str | Cell]] = []
     for method in context.methods:
         for run in sorted(method.runs, key=lambda run: (str(run.fold), str(run.seed))):
             cells: list[str | Cell] = [
                 method.name,
-                *(NONE if number_or_name is None else str(number_or_name) for number_or_name in (run.fold, run.seed)),
+                *(NONE if key is None else str(key) for key in (run.fold, run.seed)),
             ]
-            for number_or_name in context.comparisons:
-                sums = (
-                    run.questions[number_or_name.question].sums.get(MODEL, {})
-                    if number_or_name.question in run.questions
-                    else {}
-                )
-                cells += [
-                    number(number_or_name.measure.score_of(sums.values())) if sums else NONE,
-                    f"{len(sums):,}" if sums else NONE,
-                ]
+            for comparison in context.comparisons:
+                errors = run.questions.get(comparison.question)
+                sums = errors.sums.get(MODEL, {}) if errors else {}
+                score = number(comparison.measure.score_of(sums.values())) if sums else NONE
+                cells += [score, f"{len(sums):,}" if sums else NONE]
             rows.append([*cells, *context.task.run_columns(run).values()])
     if not rows:
         return []
     heads: list[str] = ["", "fold", "seed"]
-    for number_or_name in context.comparisons:
-        heads += [f"{number_or_name.question.where}: {number_or_name.measure.scored}", "recordings"]
+    for comparison in context.comparisons:
+        heads += [f"{comparison.question.where}: {comparison.measure.scored}", "recordings"]
     heads += list(context.task.run_columns(context.runs[0]))
     return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
 
 
-def basis(context: Context) -> list[Fold]:
-    """Return the basis and the limits of the numbers."""
+def basis_folds(context: Context) -> list[Fold]:
+    """Return a fold with the basis and the limits of the numbers."""
     texts = list(context.task.caveats(context))
     texts += [PICKED] if len(context.methods) > 1 else []
     texts += [SIMULATED] if context.simulated else []
@@ -313,8 +319,8 @@ def basis(context: Context) -> list[Fold]:
     return [Fold("Basis and limits", [SmallPrint(text) for text in dict.fromkeys(texts) if text])] if texts else []
 
 
-def source(context: Context) -> list[Fold]:
-    """Return the provenance of the best method's median run."""
+def source_folds(context: Context) -> list[Fold]:
+    """Return a fold with the provenance of the best method's median run, or of the first result without comparisons."""
     if not context.comparisons:
         return [Fold("Where it comes from", provenance_blocks(result.manifest)) for result in context.bare[:1]]
     first = context.comparisons[0]
@@ -326,14 +332,15 @@ def source(context: Context) -> list[Fold]:
 
 
 def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
+    """Return the counts of methods, results and recordings or other clusters as texts, without those of a single result."""
     counts = []
     if context.methods:
         counts.append(counted(len(context.methods), "methods"))
     if len(results) > 1:
         counts.append(counted(len(results), "results"))
-    recording_names = {
-        name for run in context.runs for errors in run.questions.values() for name in errors.sums.get(MODEL, {})
-    }
+    recording_names: set[str] = set()
+    for run in context.runs:
+        recording_names.update(*(errors.sums.get(MODEL, {}) for errors in run.questions.values()))
     if recording_names:
         names = {comparison.measure.cluster for comparison in context.comparisons}
         word = next(iter(names)) if len(names) == 1 else context.comparisons[0].measure.cluster

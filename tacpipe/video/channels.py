@@ -5,6 +5,7 @@ A row depends on the frames up to it only, so a recording and a live session giv
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -57,13 +58,11 @@ class DifferenceChannels:
                 pa.float32(),
                 metadata={"unit": "count", **_place(row, column, self._columns), "component": colour},
             )
-            for row in range(1, self._rows + 1)
-            for column in range(1, self._columns + 1)
-            for colour in COLOURS
+            for row, column, colour in product(range(1, self._rows + 1), range(1, self._columns + 1), COLOURS)
         ]
 
     def values(self, image: Bytes) -> AnyFloats:
-        """Return the brightness differences of the next frame (cell and colour,)."""
+        """Return the brightness differences of the next frame from the mean of the first frames, flat (cell and colour,)."""
         means = cell_means(image, self._rows, self._columns)
         if self._reference_count < self._reference_frames:
             self._reference_sum, self._reference_count = self._reference_sum + means, self._reference_count + 1
@@ -94,9 +93,7 @@ class MarkerChannels:
                 pa.float32(),
                 metadata={"unit": unit, **_place(row, column, self._columns), "axis": axis},
             )
-            for row in range(1, self._rows + 1)
-            for column in range(1, self._columns + 1)
-            for axis in ("x", "y")
+            for row, column, axis in product(range(1, self._rows + 1), range(1, self._columns + 1), ("x", "y"))
         ]
         quality = pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})
         return [*displacements, quality]
@@ -138,7 +135,7 @@ class IntraDecoder:
         self._pixels = GREY if grey else RGB
 
     def decode(self, packet: bytes) -> Bytes | None:
-        """Return the image of a packet, or None for a damaged one."""
+        """Return the image of a packet, or None for a damaged one or one of another size."""
         import av
 
         try:
@@ -166,7 +163,10 @@ class LiveChannels:
         self._decoder = IntraDecoder(video_format, grey=channels.grey)
 
     def push(self, frames: FrameBatch) -> pa.Table:
-        """Return the rows of the frames that can be decoded, with their clocks."""
+        """Return the rows of the frames that can be decoded, with their clocks; others are omitted.
+
+        Raises the errors of the channels' ``values``.
+        """
         import pyarrow as pa
 
         rows: list[int] = []

@@ -76,22 +76,26 @@ def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Itera
 
 
 def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> Iterator[pa.Table]:
-    """Yield the rows ``start`` to ``stop`` of a stream of frames as small batches, for `decode_frames`."""
+    """Yield the rows ``start`` to ``stop`` (exclusive; None for the end) of a stream of frames in small batches.
+
+    They are the batches that `decode_frames` reads.
+    """
     first = 0
-    stop = columns.num_rows if stop is None else stop
+    end = columns.num_rows if stop is None else stop
     for batch in columns.batches([PACKET, PTS, DTS, KEY_FRAME], BATCH_ROWS):
-        rows = batch.slice(max(0, start - first), max(0, stop - max(first, start)))
+        rows = batch.slice(max(0, start - first), max(0, end - max(first, start)))
         if rows.num_rows:
             yield rows
         first += batch.num_rows
-        if first >= stop:
+        if first >= end:
             return
 
 
 def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) -> dict[int, Bytes]:
     """Return the images of some rows of a stream of frames by row, as `decode_frames` yields them.
 
-    For each row, decoding starts at the preceding key frame. Raises `TacpipeError` if the stream has no frames.
+    For each row, decoding starts at the preceding key frame. Raises `TacpipeError` if the stream has no frames, or one
+    cannot be decoded. Rows without an image are missing.
     """
     video_format = read_format(columns)
     if video_format is None:
@@ -111,7 +115,10 @@ def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) ->
 
 
 def _decode(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, Any]]:
-    """Yield row number and decoded frame of PyAV."""
+    """Yield row number and decoded frame of PyAV.
+
+    Raises the errors of `decode_frames`, and if the first is no key frame.
+    """
     with extras.explain_missing(NEEDED_BY):
         import av
     context = open_decoder(video_format)
@@ -176,6 +183,7 @@ def padded_packet(data: bytes | memoryview) -> Any:
 
 
 def _row_and_frame(video_format: VideoFormat, frame: Any) -> tuple[int, Any]:
+    """Return row number and frame. Raises `TacpipeError` if its size is not the stream's."""
     if (frame.width, frame.height) != (video_format.width_px, video_format.height_px):
         raise TacpipeError(
             f"Frame {frame.pts} has {frame.width} x {frame.height} pixels, and the stream {video_format.width_px} x "

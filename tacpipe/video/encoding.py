@@ -22,7 +22,10 @@ def jpeg_format(width_px: int, height_px: int, rate_hz: Fraction | None, pixel_f
 
 
 def encode_images(video_format: VideoFormat, images: Iterable[Bytes]) -> Iterator[bytes]:
-    """Yield the JPEG of each image, uint8 (height, width, rgb), in the format that `jpeg_format` returned."""
+    """Yield the JPEG of each image, uint8 (height, width, rgb), in the format that `jpeg_format` returned.
+
+    Raises `MissingModuleError` if PyAV is not installed.
+    """
     with extras.explain_missing(ENCODED_BY):
         import av
     encoder = JpegEncoder(video_format.width_px, video_format.height_px, video_format.pixel_format)

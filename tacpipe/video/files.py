@@ -60,7 +60,7 @@ class VideoScan:
         return len(self.pts)
 
     def times_ns(self) -> Times:
-        """Return the time of each frame since the first in ns, shape (frame,)."""
+        """Return the time of each frame in ns since the first, rounded, shape (frame,)."""
         step_ns = self.video_format.time_base * 10**9
         numerator, denominator = step_ns.numerator, step_ns.denominator
         ticks = (self.pts - self.pts[:1]).tolist()
@@ -87,25 +87,25 @@ def scan(path: Path) -> VideoScan:
     """
     with _open_input(path) as container:
         video = _video_stream(path, container)
-        rows = [
+        packets = [
             (packet.pts, packet.dts, packet.is_keyframe, packet.size)
             for packet in container.demux(video)
             if packet.size
         ]
-        if not rows:
+        if not packets:
             raise TacpipeError(f"{path} has no frame. Copy it again from its source, or leave it out.")
-        video_format = _format(path, video)
+        video_format = _read_video_format(path, video)
         rates = (video.base_rate, video.average_rate)
         delayed = bool(video.codec_context.has_b_frames)
-    pts, dts = [row[0] for row in rows], [row[1] for row in rows]
+    pts, dts, is_key_frame, sizes = (list(column) for column in zip(*packets, strict=True))
     if None in pts or len(set(pts)) < len(pts) or (delayed and DEMUXERS[path.suffix.lower()] in WITHOUT_PTS):
-        order = _presentation_order(path, video_format) if delayed else list(range(len(rows)))
-        dts = _strict(dts)
+        order = _presentation_order(path, video_format) if delayed else list(range(len(packets)))
+        dts = _increasing(dts)
         delay = max(dts[position] - dts[rank] for rank, position in enumerate(order))
         pts = [stamp for _, stamp in sorted((position, dts[rank] + delay) for rank, position in enumerate(order))]
-    elif None in dts or not _grows(dts):
+    elif None in dts or not _increases(dts):
         sorted_pts = sorted(pts)
-        delay = max(early - stamp for early, stamp in zip(sorted_pts, pts, strict=True))
+        delay = max(early - late for early, late in zip(sorted_pts, pts, strict=True))
         dts = [stamp - delay for stamp in sorted_pts]
     order_by_pts = np.argsort(np.array(pts, np.int64), kind="stable")
     all_pts, all_dts = np.array(pts, np.int64)[order_by_pts], np.array(dts, np.int64)[order_by_pts]
@@ -118,28 +118,26 @@ def scan(path: Path) -> VideoScan:
         ),
         all_pts,
         all_dts,
-        np.array([row[2] for row in rows], bool)[order_by_pts],
+        np.array(is_key_frame, bool)[order_by_pts],
         order_by_pts.astype(np.int64),
-        sum(row[3] for row in rows),
+        sum(sizes),
     )
 
 
 def scan_images(paths: Sequence[Path]) -> VideoFormat:
     """Return the format of a stream whose packets are image files, each a key frame.
 
-    Raises `TacpipeError` with the file's name if it is not an image or differs from the first in kind or size.
+    Raises `TacpipeError` with the file's name if it is not an image or differs from the first in kind or size, and if
+    there are no files.
     """
     first: VideoFormat | None = None
     for path in paths:
         codec = IMAGE_CODECS[path.suffix.lower()]
         with _open_input(path, IMAGE_DEMUXERS[codec]) as container:
-            image_format = replace(_format(path, _video_stream(path, container)), time_base=MICROSECOND)
+            image_format = replace(_read_video_format(path, _video_stream(path, container)), time_base=MICROSECOND)
         first = first or replace(image_format, codec=codec)
-        size, first_size = (
-            (codec, image_format.width_px, image_format.height_px),
-            (first.codec, first.width_px, first.height_px),
-        )
-        if size != first_size:
+        size = (codec, image_format.width_px, image_format.height_px)
+        if size != (first.codec, first.width_px, first.height_px):
             raise TacpipeError(
                 f"{path} is {codec} of {size[1]} x {size[2]} pixels, and {paths[0]} is {first.codec} of {first.width_px} x "
                 f"{first.height_px}. The images of a stream have one kind and size: put others into another folder."
@@ -152,7 +150,8 @@ def scan_images(paths: Sequence[Path]) -> VideoFormat:
 def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
     """Return a stream of frames from image files, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    Presentation times are distinct microseconds since the first frame. Raises `TacpipeError` as `scan_images` does.
+    Presentation times are distinct microseconds since the first frame. ``stamp_origin`` is the origin of timestamps
+    that do not come from a clock. Raises `TacpipeError` as `scan_images` does.
     """
     video_format = scan_images(paths)
     index = np.arange(len(paths))
@@ -167,23 +166,24 @@ def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
     Raises `TacpipeError` if the file has changed since.
     """
     rows = np.argsort(frames.packet_index).tolist()  # rows in the order of the file
-    waiting: list[tuple[int, bytes]] = []
-    following = 0
+    early_packets: list[tuple[int, bytes]] = []
+    next_row = 0
     with _open_input(path) as container:
         packets = (packet for packet in container.demux(_video_stream(path, container)) if packet.size)
         for row, packet in zip(rows, packets, strict=False):
-            heapq.heappush(waiting, (row, bytes(packet)))
-            while waiting and waiting[0][0] == following:
-                yield heapq.heappop(waiting)[1]
-                following += 1
-    if following != len(frames):
+            heapq.heappush(early_packets, (row, bytes(packet)))
+            while early_packets and early_packets[0][0] == next_row:
+                yield heapq.heappop(early_packets)[1]
+                next_row += 1
+    if next_row != len(frames):
         raise TacpipeError(f"{path} changed while it was read. Run the command again.")
 
 
 def read_stream(path: Path, frames: VideoScan, t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
     """Return the stream of frames of a file, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    Raises `TacpipeError` if the file cannot be read, also while the stream is read.
+    ``stamp_origin`` is the origin of timestamps that do not come from a clock. Raises `TacpipeError` if the file cannot
+    be read, also while the stream is read.
     """
     return packet_stream(
         frames.video_format,
@@ -203,9 +203,10 @@ def packet_stream(
     seq: Int64s | None,
     stamp_origin: str | None,
 ) -> pa.RecordBatchReader:
-    """Return a stream of frames from packets in presentation order.
+    """Return a stream of frames from packets in presentation order, taken on demand.
 
-    ``clocks`` are ``pts``, ``dts`` and ``key_frame`` of each packet (frame,).
+    ``clocks`` are ``pts``, ``dts`` and ``key_frame`` of each packet, each (frame,). ``seq`` counts frames, None without
+    a counter.
     """
     import pyarrow as pa
 
@@ -232,17 +233,18 @@ def packet_stream(
 def write_file(path: Path, video_format: VideoFormat, batches: Iterable[pa.Table]) -> None:
     """Write rows of a stream of frames, starting at a key frame, to the video file ``path`` of any supported extension.
 
-    Packets are copied. Times start at 0. Raises `TacpipeError` if the kind of file does not support the codec.
+    Packets are copied. Times start at 0. Raises `TacpipeError` if the kind of file does not support the codec, and
+    `MissingModuleError` if PyAV is not installed.
     """
     with extras.explain_missing("Writing video"):
         import av
     try:
         with av.open(str(path), "w") as container:
             stream = add_stream(container, video_format)
-            start = None
+            start_pts = None
             for packet, columns in decode_order_packets(video_format, batches):
-                start = packet.pts if start is None else start
-                packet.pts, packet.dts = columns[PTS] - start, columns[DTS] - start
+                start_pts = packet.pts if start_pts is None else start_pts
+                packet.pts, packet.dts = columns[PTS] - start_pts, columns[DTS] - start_pts
                 packet.stream = stream
                 container.mux_one(packet)
     except (av.error.FFmpegError, ValueError) as error:
@@ -272,17 +274,17 @@ def add_stream(container: Any, video_format: VideoFormat) -> Any:
 def decode_order_packets(
     video_format: VideoFormat, batches: Iterable[pa.Table]
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Yield PyAV packets with their times, and the columns of their rows, in decoding order."""
+    """Yield PyAV packets with their times, and the columns of their rows, in decoding order, without empty packets."""
     import av
 
-    step = 1
+    frame_ticks = 1
     if video_format.nominal_rate_hz:
-        step = max(1, round(1 / (video_format.nominal_rate_hz * video_format.time_base)))
+        frame_ticks = max(1, round(1 / (video_format.nominal_rate_hz * video_format.time_base)))
     for _, columns in in_decode_order(video_format, batches):
         if not columns[PACKET]:
             continue
         packet = av.Packet(columns[PACKET])
-        packet.time_base, packet.duration = video_format.time_base, step
+        packet.time_base, packet.duration = video_format.time_base, frame_ticks
         packet.pts, packet.dts = int(columns[PTS]), int(columns[DTS])
         packet.is_keyframe = bool(columns[KEY_FRAME])
         yield packet, columns
@@ -290,7 +292,10 @@ def decode_order_packets(
 
 @contextmanager
 def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
-    """Yield a video file opened by PyAV; errors of FFmpeg name the file."""
+    """Yield a video file opened by PyAV, with the ``demuxer`` or that of its extension.
+
+    Raises `TacpipeError` with the file's name for errors of FFmpeg, also within the block.
+    """
     with extras.explain_missing(NEEDED_BY):
         import av
     with regular.failing(path), regular.opened(path) as file:
@@ -310,7 +315,8 @@ def _video_stream(path: Path, container: Any) -> Any:
     return container.streams.video[0]
 
 
-def _format(path: Path, video: Any) -> VideoFormat:
+def _read_video_format(path: Path, video: Any) -> VideoFormat:
+    """Return the format of a file's video stream. Raises `TacpipeError` if the file does not state its size."""
     context = video.codec_context
     if not (context.width and context.height and video.time_base):
         raise TacpipeError(
@@ -327,7 +333,7 @@ def _format(path: Path, video: Any) -> VideoFormat:
 
 
 def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
-    """Return the file positions of frames in presentation order; frames that are not presented follow."""
+    """Return the file positions of frames in presentation order, found by decoding; those never presented follow."""
     order: list[int] = []
     position = 0
     with _open_input(path) as container:
@@ -341,13 +347,13 @@ def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
     return order + sorted(set(range(position)) - set(order))
 
 
-def _strict(dts: Sequence[int | None]) -> list[int]:
+def _increasing(dts: Sequence[int | None]) -> list[int]:
     """Return strictly increasing decoding times: those of the file, or indices if it has none."""
     stamps = [stamp for stamp in dts if stamp is not None]
-    return stamps if len(stamps) == len(dts) and _grows(stamps) else list(range(len(dts)))
+    return stamps if len(stamps) == len(dts) and _increases(stamps) else list(range(len(dts)))
 
 
-def _grows(stamps: Sequence[int | None]) -> bool:
+def _increases(stamps: Sequence[int | None]) -> bool:
     return all(early is not None and late is not None and early < late for early, late in itertools.pairwise(stamps))
 
 

@@ -41,23 +41,26 @@ def read_shape(image: bytes) -> ImageShape | None:
     """Return the size and the pixel format of a JPEG image, or None for bytes that are not a complete JPEG image."""
     if image[:2] != START or image.rfind(END, max(2, len(image) - END_BYTES)) < 0:
         return None
-    place = 2
-    while place + 4 <= len(image) and image[place] == 0xFF:
-        marker, size = image[place + 1], int.from_bytes(image[place + 2 : place + 4])
+    offset = 2
+    while offset + 4 <= len(image) and image[offset] == 0xFF:
+        marker, size = image[offset + 1], int.from_bytes(image[offset + 2 : offset + 4])
         if 0xC0 <= marker <= 0xC2:
-            return _shape_of_frame(image[place + 4 : place + 2 + size])
-        place += 2 + size
+            return _shape_of_frame(image[offset + 4 : offset + 2 + size])
+        offset += 2 + size
     return None
 
 
 def _shape_of_frame(segment: bytes) -> ImageShape | None:
-    """Return the shape in a start-of-frame segment: bits, height, width, components, and the sampling of each."""
+    """Return the shape in a start-of-frame segment: bits, height, width, components, and the sampling of each.
+
+    None if the segment is incomplete or its pixel format is unknown.
+    """
     if len(segment) < 6 or segment[0] != 8 or len(segment) < 6 + 3 * segment[5]:
         return None
     height, width, components = int.from_bytes(segment[1:3]), int.from_bytes(segment[3:5]), segment[5]
     pixel_format = "gray" if components == 1 else ""
     if components == 3:
-        (luma_x, luma_y), (chroma_x, chroma_y) = (divmod(segment[place], 16) for place in (7, 10))
+        (luma_x, luma_y), (chroma_x, chroma_y) = (divmod(segment[offset], 16) for offset in (7, 10))
         ratio = (luma_x // max(chroma_x, 1), luma_y // max(chroma_y, 1))
         pixel_format = PIXEL_FORMATS.get(ratio, "")
     return ImageShape(width, height, pixel_format) if pixel_format and width and height else None
@@ -105,7 +108,9 @@ def raw_format(encoding: str, width_px: int, height_px: int, *, big_endian: bool
 
 
 def array_format(shape: tuple[int, ...], kind: ArrayType) -> VideoFormat | None:
-    """Return the format of decoded images (frame, row, column), or with colours last or after the frame; else None.
+    """Return the format of decoded images (frame, row, column), or None if they cannot be stored as raw images.
+
+    With colours, these are the last axis or the one after the frame.
 
     >>> array_format((9, 3, 48, 64), np.dtype("uint8")).describe()
     'rawvideo, 64 x 48 pixels'
@@ -155,25 +160,25 @@ def frames_from_images(
     if name is None:
         return rows
     batches = iter(rows.to_batches(BATCH_ROWS)) if isinstance(rows, pa.Table) else iter(rows)
-    head = list(itertools.islice(batches, 1))
-    video_format = _column_format(rows.schema.field(name), head, name)
+    first_batches = list(itertools.islice(batches, 1))
+    video_format = _column_format(rows.schema.field(name), first_batches, name)
     if video_format is None:
         if isinstance(rows, pa.Table):
             return rows
-        return pa.RecordBatchReader.from_batches(rows.schema, itertools.chain(head, batches))
+        return pa.RecordBatchReader.from_batches(rows.schema, itertools.chain(first_batches, batches))
     rate = None if rate_hz is None else Fraction(rate_hz).limit_denominator(1001)
     video_format = replace(video_format, nominal_rate_hz=rate)
-    at = rows.schema.get_field_index(name)
+    column_index = rows.schema.get_field_index(name)
     fields = list(rows.schema)
-    schema = pa.schema([*fields[:at], *video_format.fields(), *fields[at + 1 :]])
+    schema = pa.schema([*fields[:column_index], *video_format.fields(), *fields[column_index + 1 :]])
     reader = pa.RecordBatchReader.from_batches(
-        schema, _packets(itertools.chain(head, batches), name, video_format, schema, place)
+        schema, _packet_batches(itertools.chain(first_batches, batches), name, video_format, schema, place)
     )
     return reader.read_all() if isinstance(rows, pa.Table) else reader
 
 
 def _image_column(schema: pa.Schema) -> str | None:
-    """Return the name of a stream's only column of images, or None if there is none, or the stream has packets already."""
+    """Return the name of a stream's only column of images; None if there is not exactly one, or the stream has packets."""
     import pyarrow as pa
 
     names = [
@@ -185,18 +190,24 @@ def _image_column(schema: pa.Schema) -> str | None:
     return names[0] if len(names) == 1 and is_free else None
 
 
-def _column_format(field: pa.Field, head: list[pa.RecordBatch], name: str) -> VideoFormat | None:
-    """Return the format in a column's metadata, or that of the first image."""
+def _column_format(field: pa.Field, first_batches: list[pa.RecordBatch], name: str) -> VideoFormat | None:
+    """Return the format in the metadata of a column of images, or that of the first image; None if it is not known.
+
+    Raises the errors of `VideoFormat.from_metadata`.
+    """
     if b"codec" in field.metadata:
         return VideoFormat.from_metadata(field.metadata)
-    images = (image.as_py() for batch in head for image in batch.column(name))
+    images = (image.as_py() for batch in first_batches for image in batch.column(name))
     return next((image_format(image) for image in images if image), None)
 
 
-def _packets(
+def _packet_batches(
     batches: Iterator[pa.RecordBatch], name: str, video_format: VideoFormat, schema: pa.Schema, place: str
 ) -> Iterator[pa.RecordBatch]:
-    """Yield batches with ``packet``, ``pts`` (microseconds since the first row, distinct), ``dts`` and ``key_frame``."""
+    """Yield batches with ``packet``, ``pts`` (microseconds since the first row, distinct), ``dts`` and ``key_frame``.
+
+    Raises `TacpipeError` as `_expect_alike` does.
+    """
     import pyarrow as pa
 
     first_ns, last_pts, row = None, -1, 0

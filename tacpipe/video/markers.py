@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -46,13 +47,16 @@ def use_one_thread() -> None:
 
 
 def detect(grey: Bytes) -> Floats:
-    """Return the centroids in px (marker, xy) of the dark dots in an image (height, width), except at its border."""
+    """Return the centroids in px (marker, xy) of the dark dots in an image (height, width), except at its border.
+
+    Raises `MissingModuleError` if OpenCV is not installed.
+    """
     with extras.explain_missing(NEEDED_BY):
         import cv2
     side = max(3, grey.shape[1] // NEIGHBOURHOOD | 1)
     smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
-    around = cv2.boxFilter(smooth, -1, (side, side), borderType=cv2.BORDER_REPLICATE)
-    excess = np.clip(1 - smooth / np.maximum(around, 1) - MIN_DARKNESS, 0, None)  # (height, width)
+    surroundings = cv2.boxFilter(smooth, -1, (side, side), borderType=cv2.BORDER_REPLICATE)
+    excess = np.clip(1 - smooth / np.maximum(surroundings, 1) - MIN_DARKNESS, 0, None)  # (height, width)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((excess > 0).astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
     inside = (left > 0) & (top > 0) & (left + width < grey.shape[1]) & (top + height < grey.shape[0])
@@ -60,14 +64,14 @@ def detect(grey: Bytes) -> Floats:
     is_dot[0] = False  # the gel
     if not is_dot.any():
         return np.empty((0, 2))
-    usual_area = np.median(area[is_dot])
-    is_dot &= (area < AREA_RATIO * usual_area) & (area > usual_area / AREA_RATIO)
+    median_area = np.median(area[is_dot])
+    is_dot &= (area < AREA_RATIO * median_area) & (area > median_area / AREA_RATIO)
     flat, weights = labels.ravel(), excess.ravel().astype(np.float64)
     sums = np.bincount(flat, weights, count)
     y, x = np.indices(grey.shape)
     centroids = [np.bincount(flat, weights * axis.ravel(), count) / np.maximum(sums, 1e-12) for axis in (x, y)]
-    places_px: Floats = np.column_stack(centroids)[is_dot]
-    return places_px
+    dots_px: Floats = np.column_stack(centroids)[is_dot]
+    return dots_px
 
 
 def find_grid(grey: Bytes, rows: int, columns: int) -> MarkerGrid | None:
@@ -96,12 +100,9 @@ def find_grid(grey: Bytes, rows: int, columns: int) -> MarkerGrid | None:
         ]
         return -len(part), float(np.linalg.norm(np.mean(part, axis=0) - centre)) if part else np.inf
 
-    corners = [
-        (row, column)
-        for row in range(row_first, max(row_first, row_last - rows + 1) + 1)
-        for column in range(column_first, max(column_first, column_last - columns + 1) + 1)
-    ]
-    top, left = min(corners, key=rank)
+    tops = range(row_first, max(row_first, row_last - rows + 1) + 1)
+    lefts = range(column_first, max(column_first, column_last - columns + 1) + 1)
+    top, left = min(product(tops, lefts), key=rank)
     positions = np.full((rows * columns, 2), np.nan)
     for (row, column), marker in cells.items():
         if 0 <= row - top < rows and 0 <= column - left < columns:
@@ -146,34 +147,31 @@ class MarkerTracker:
         tracked = np.flatnonzero(~np.isnan(self.positions_px[:, 0]))
         if not len(tracked):
             return expected, is_confirmed
-        follow: Any = partial(cv2.calcOpticalFlowPyrLK, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS)
+        track: Any = partial(cv2.calcOpticalFlowPyrLK, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS)
         start = self.positions_px[tracked].astype(np.float32)[:, None]
-        ahead, is_ahead, _ = follow(self.previous, grey, start, None)
-        back, is_back, _ = follow(grey, self.previous, ahead, None)
-        agrees = np.linalg.norm((back - start)[:, 0], axis=1) < CONFIRMED_PX
-        usable = is_ahead.ravel().astype(bool)
-        expected[tracked[usable]] = ahead[usable, 0]
-        is_confirmed[tracked] = usable & is_back.ravel().astype(bool) & agrees
+        moved, is_tracked, _ = track(self.previous, grey, start, None)
+        returned, is_returned, _ = track(grey, self.previous, moved, None)
+        agrees = np.linalg.norm((returned - start)[:, 0], axis=1) < CONFIRMED_PX
+        usable = is_tracked.ravel().astype(bool)
+        expected[tracked[usable]] = moved[usable, 0]
+        is_confirmed[tracked] = usable & is_returned.ravel().astype(bool) & agrees
         return expected, is_confirmed
 
     def _match(self, expected: Floats, detections: Floats, detected: Int64s) -> Int64s:
         """Return the detection of each marker (marker,), -1 for none; markers in ``detected`` keep theirs."""
-        detected = detected.copy()
+        matched = detected.copy()
         free = np.setdiff1d(np.arange(len(detections)), detected)
-        wanting = np.flatnonzero((detected < 0) & ~np.isnan(expected[:, 0]))
-        if len(free) and len(wanting):
-            distances = np.linalg.norm(expected[wanting][:, None] - detections[free], axis=2)  # (marker, detection)
+        undetected = np.flatnonzero((detected < 0) & ~np.isnan(expected[:, 0]))
+        if len(free) and len(undetected):
+            distances = np.linalg.norm(expected[undetected][:, None] - detections[free], axis=2)  # (marker, detection)
             nearest, nearest_marker = distances.argmin(axis=1), distances.argmin(axis=0)
-            mutual = nearest_marker[nearest] == np.arange(len(wanting))
+            mutual = nearest_marker[nearest] == np.arange(len(undetected))
             close = distances.min(axis=1) < NEXT * self.grid.pitch_px
-            detected[wanting[mutual & close]] = free[nearest[mutual & close]]
-        return detected
+            matched[undetected[mutual & close]] = free[nearest[mutual & close]]
+        return matched
 
     def _suggest(self, detected: Int64s, detections: Floats) -> Floats:
-        """Return positions of markers (marker, xy) estimated from the displacement of detected neighbours.
-
-        NaN without any.
-        """
+        """Return positions of markers (marker, xy) from the displacements of detected neighbours, NaN without any."""
         shape = (self.grid.rows, self.grid.columns, 2)
         displacements = np.full_like(self.grid.positions_px, np.nan)
         is_detected = detected >= 0
@@ -181,8 +179,7 @@ class MarkerTracker:
         padded = np.pad(displacements.reshape(shape), ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
         shifted = [
             padded[row : row + shape[0], column : column + shape[1]]
-            for row in range(3)
-            for column in range(3)
+            for row, column in product(range(3), repeat=2)
             if (row, column) != (1, 1)
         ]
         stack = np.array(shifted).reshape(8, -1, 2)  # (neighbour, marker, xy)
@@ -209,22 +206,25 @@ def _steps(detections: Floats) -> Floats | None:
 
 
 def _cells(detections: Floats, steps: Floats, first: int) -> dict[tuple[int, int], int]:
-    """Return the index of the marker in each cell (row, column), spreading from the marker ``first``."""
+    """Return the index of the detection in each cell (row, column), spreading from the detection ``first`` in cell (0, 0).
+
+    ``steps`` are those that `_steps` returns.
+    """
     pitch = float(np.linalg.norm(steps, axis=1).mean())
     cells = {(0, 0): first}
-    taken = {first}
+    assigned = {first}
     pending = [(0, 0)]
     while pending:
         row, column = pending.pop(0)
-        place = detections[cells[row, column]]
+        position = detections[cells[row, column]]
         for row_step, column_step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
             cell = (row + row_step, column + column_step)
             if cell in cells:
                 continue
-            distances = np.linalg.norm(detections - (place + column_step * steps[0] + row_step * steps[1]), axis=1)
+            distances = np.linalg.norm(detections - (position + column_step * steps[0] + row_step * steps[1]), axis=1)
             nearest = int(distances.argmin())
-            if distances[nearest] < NEXT * pitch and nearest not in taken:
+            if distances[nearest] < NEXT * pitch and nearest not in assigned:
                 cells[cell] = nearest
-                taken.add(nearest)
+                assigned.add(nearest)
                 pending.append(cell)
     return cells

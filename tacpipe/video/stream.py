@@ -47,6 +47,7 @@ class VideoFormat:
     reorder_frames: int = 0  # maximum number of rows by which a frame is decoded before it is presented
 
     def __post_init__(self) -> None:
+        """Check the values. Raises `TacpipeError` for implausible ones."""
         sides_fit = 0 < self.width_px <= MAX_SIDE_PX and 0 < self.height_px <= MAX_SIDE_PX
         if not sides_fit or self.time_base <= 0 or not 0 <= self.reorder_frames <= MAX_REORDER or not self.codec:
             raise TacpipeError(
@@ -61,7 +62,7 @@ class VideoFormat:
         return f"{plain(self.codec)}, {self.width_px} x {self.height_px} pixels{rate}"
 
     def to_metadata(self) -> dict[str, str]:
-        """Return the metadata of the packet column."""
+        """Return the metadata of the packet column, from which `from_metadata` restores the format."""
         rate = {} if self.nominal_rate_hz is None else {_RATE: str(self.nominal_rate_hz)}
         headers = {_EXTRADATA: base64.b64encode(self.extradata).decode()} if self.extradata else {}
         return {
@@ -152,18 +153,18 @@ def in_decode_order(
 
     At most ``reorder_frames`` frames are buffered.
     """
-    waiting: list[tuple[int, int, dict[str, int | bool | bytes]]] = []  # dts, row, columns
+    buffered: list[tuple[int, int, dict[str, int | bool | bytes]]] = []  # dts, row, columns
     row = 0
     for batch in batches:
         names = [name for name in (PACKET, PTS, DTS, KEY_FRAME) if name in batch.column_names]
         for columns in batch.select(names).to_pylist():
-            heapq.heappush(waiting, (columns[DTS], row, columns))
+            heapq.heappush(buffered, (columns[DTS], row, columns))
             row += 1
-            if len(waiting) > video_format.reorder_frames:
-                _, index, frame = heapq.heappop(waiting)
+            if len(buffered) > video_format.reorder_frames:
+                _, index, frame = heapq.heappop(buffered)
                 yield index, frame
-    while waiting:
-        _, index, frame = heapq.heappop(waiting)
+    while buffered:
+        _, index, frame = heapq.heappop(buffered)
         yield index, frame
 
 
@@ -171,7 +172,7 @@ def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int,
     """Return the smallest range of rows that contains rows ``start`` to ``stop`` (exclusive) and can be decoded by itself.
 
     It starts at a key frame, and no frame in it needs one that is presented later. Raises `TacpipeError` if no key
-    frame precedes ``start``.
+    frame precedes ``start``, or the rows are not in the stream.
     """
     if not 0 <= start < stop <= len(dts):
         raise TacpipeError(f"The rows {start} to {stop} are not in a stream of {len(dts)} frames.")

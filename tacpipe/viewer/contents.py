@@ -103,10 +103,12 @@ class DrawnContents:
         """The times of the first and the last sample of all streams; (0, 0) if there are no times."""
         timed: list[Curves | Taxels | Path | Frames]
         timed = [*self.curves, *self.truth, *self.taxels, *self.paths, *self.frames]
-        stamps = [member.t_ns for member in timed if len(member.t_ns)]
-        stamps += [strip.ends_ns for strip in self.strips if strip.images]
-        stamps += [np.array([points.t_ns]) for points in self.clouds if points.t_ns is not None]
-        return (min(int(t_ns[0]) for t_ns in stamps), max(int(t_ns[-1]) for t_ns in stamps)) if stamps else (0, 0)
+        times_ns = [member.t_ns for member in timed if len(member.t_ns)]
+        times_ns += [strip.ends_ns for strip in self.strips if strip.images]
+        times_ns += [np.array([points.t_ns]) for points in self.clouds if points.t_ns is not None]
+        if not times_ns:
+            return 0, 0
+        return min(int(t_ns[0]) for t_ns in times_ns), max(int(t_ns[-1]) for t_ns in times_ns)
 
     @property
     def is_empty(self) -> bool:
@@ -120,7 +122,7 @@ class DrawnContents:
 
     @property
     def streams_by_priority(self) -> list[str]:
-        """The streams with curves, ordered by the priority of their quantities."""
+        """The streams with curves, ordered by the priority of their quantities, `QUANTITY_PRIORITY`."""
 
         def rank(name: str) -> int:
             quantities = [member.quantity for member in self.curves if member.stream == name]
@@ -149,8 +151,9 @@ def collect(
     """Return the contents of a recording to draw.
 
     ``predictions`` is its table in a dataset of predictions or results; ``row`` is its row, if such a dataset has one
-    row per recording. If the ``chain`` of its dataset segmented contacts, their padding is a separate span. ``video`` is
-    the same recording with the frames of cameras, in which markers are drawn.
+    row per recording. If the ``chain`` of its dataset segmented contacts, their padding is a separate span. ``video``
+    is the same recording with the frames of cameras, in which markers are drawn. Raises `TacpipeError` if frames cannot
+    be decoded.
     """
     tables = {stream: recording.table(stream) for stream in recording.streams}
     contents = _collect_tables(recording.name, recording.attributes, tables, predictions, row)
@@ -187,7 +190,7 @@ def for_picture(recording: Recording, *, chain: Sequence[Step] = ()) -> DrawnCon
 
 
 def _strip(stream: str, stored: Columns) -> FrameStrip:
-    """Return the frames in the middle of `STRIP_FRAMES` equal intervals, without duplicates."""
+    """Return the frames of a stream in the middle of `STRIP_FRAMES` equal intervals, without duplicates."""
     t_ns = stored.column(TIME).to_numpy()
     if not len(t_ns):
         return FrameStrip(stream, t_ns, [], t_ns)
@@ -199,6 +202,7 @@ def _strip(stream: str, stored: Columns) -> FrameStrip:
 
 
 def _for_picture(recording: Recording, columns: Mapping[str, Columns], chain: Sequence[Step]) -> DrawnContents:
+    """Return the contents for a picture without frames: long streams are subsampled, and have the gaps of clocks."""
     long_streams = {
         stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MAX_VALUES
     }
@@ -245,7 +249,7 @@ def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnCont
 
 
 def _subsample(stored: Columns) -> pa.Table:
-    """Return some rows of a long stream, chosen as in `for_picture`, without columns of bytes."""
+    """Return some rows of a long stream, chosen as in `for_picture`, and the first second, without columns of bytes."""
     import pyarrow as pa
 
     names = [channel.name for channel in stored.schema if not str(channel.type).endswith("binary")]
@@ -257,10 +261,9 @@ def _subsample(stored: Columns) -> pa.Table:
         for channel, column in zip(interval.schema, interval.columns, strict=True):
             quantity = field_metadata(channel).get("quantity", "")
             if quantity in ("label", "mask"):
-                values = (
-                    column.combine_chunks().dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
-                )
-                rows.update((np.flatnonzero(values[1:] != values[:-1]) + 1).tolist())
+                encoded = column.combine_chunks().dictionary_encode()
+                codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+                rows.update((np.flatnonzero(codes[1:] != codes[:-1]) + 1).tolist())
             elif pa.types.is_integer(channel.type) or pa.types.is_floating(channel.type):
                 values = np.nan_to_num(column.to_numpy().astype(np.float64))
                 if quantity == "tactile":
@@ -276,14 +279,15 @@ def _subsample(stored: Columns) -> pa.Table:
 
 
 def _labelled_intervals(attributes: Mapping[str, Attribute], streams: Mapping[str, pa.Table]) -> list[Span]:
-    """Return the intervals that were labelled by hand, in seconds since the first sample of any stream."""
+    """Return the intervals labelled by hand as spans; they are in seconds since the first sample of any stream.
+
+    Empty if no stream has times.
+    """
     starts = [table[TIME][0].as_py() for table in streams.values() if TIME in table.column_names and table.num_rows]
-    return [
-        span
-        for label, intervals in all_intervals(attributes).items()
-        if starts
-        for span in spans.interval_spans(label, intervals, min(starts))
-    ]
+    if not starts:
+        return []
+    intervals_by_label = all_intervals(attributes)
+    return [s for label, parts in intervals_by_label.items() for s in spans.interval_spans(label, parts, min(starts))]
 
 
 def _collect_tables(
@@ -293,6 +297,10 @@ def _collect_tables(
     predictions: pa.Table | None = None,
     row: pa.Table | None = None,
 ) -> DrawnContents:
+    """Return the contents in the tables of a recording's streams; a table without times contributes only its row count.
+
+    ``predictions`` and ``row`` are those of `collect`.
+    """
     predicted = {} if row is None else _values(row)
     only_table = tables[""] if set(tables) == {""} else None
     if only_table is not None and TIME not in only_table.column_names:  # a split, or one row per recording
@@ -340,7 +348,7 @@ def _values(row: pa.Table) -> dict[str, Attribute]:
 
 
 def _truth(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
-    """Return the ground truth of a simulated recording as a stream."""
+    """Return the ground truth of a simulated recording as a stream, or an empty mapping if there is none."""
     if "truth" in tables:
         return {"truth": tables["truth"]}
     if set(tables) != {""}:
@@ -354,7 +362,7 @@ def _is_cloud(table: pa.Table) -> bool:
 
 
 def _points(stream: str, table: pa.Table) -> list[Points]:
-    """Return the clouds of a stream, one per timestamp."""
+    """Return the clouds of a stream, one per timestamp; a single one without time if the stream has no times."""
     points_m = curves.matrix(table, POSITION).astype(np.float32)
     coloured = set(COLOUR) <= set(table.column_names)
     colours = curves.matrix(table, COLOUR).astype(np.uint8) if coloured else None
@@ -369,7 +377,7 @@ def _points(stream: str, table: pa.Table) -> list[Points]:
 
 
 def _frames(stream: str, table: pa.Table) -> list[Frames]:
-    """Return the encoded images of a stream, or the frames of a video as JPEG."""
+    """Return the encoded images of each column of a stream, or the frames of a video as JPEG; empty without times."""
     if TIME not in table.column_names:
         return []
     t_ns = table.column(TIME).to_numpy()
@@ -393,7 +401,7 @@ MAX_LABELS = 40
 
 
 def to_markdown(contents: DrawnContents) -> str:
-    """Return the labels, streams and events of a recording as Markdown."""
+    """Return the labels, streams, predictions and events of a recording as Markdown, with a legend of the maps."""
     lines = [f"# {plain(contents.name)}", "", f"{contents.duration_s:.3g} s", ""]
     labels = contents.labels
     if labels:

@@ -41,12 +41,12 @@ class Panel(NamedTuple):
 
 
 def panels(contents: DrawnContents) -> list[Panel]:
-    """Return the plots over time: the touch of all fingers, one plot per unit, then at most nine plots of the streams."""
+    """Return the plots over time: the touch of all fingers, one per unit, then at most `MAX_PANELS` plots of streams."""
     plots = []
-    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
-    for unit in dict.fromkeys(finger.unit for finger in touched):
+    fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+    for unit in dict.fromkeys(finger.unit for finger in fingers):
         title = f"touch: mean distance of the taxels from rest ({unit})".replace(" ()", "")
-        same_unit = [finger for finger in touched if finger.unit == unit]
+        same_unit = [finger for finger in fingers if finger.unit == unit]
         t_ns = same_unit[0].t_ns
         loads = [
             finger.load if finger.t_ns is t_ns else np.interp(t_ns, finger.t_ns, finger.load) for finger in same_unit
@@ -82,39 +82,40 @@ def draw(contents: DrawnContents, path: Path) -> None:
 
 
 def _draw_over_time(contents: DrawnContents, lines: Sequence[Panel], strips: Sequence[FrameStrip]) -> Any:
+    """Return a figure of lines, spans, frames and taxels over time, with a line at each event."""
     from matplotlib.figure import Figure
 
     start_ns, stop_ns = contents.ends_ns
     lanes = _lanes(contents)
-    touched = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
+    fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
     heights = [*[1.9] * bool(lines), *[0.28 * len(lanes) + 0.1] * bool(lanes), *map(_strip_height, strips)]
-    heights += [*[1.1] * len(touched), *[1.15] * len(lines[1:])]
+    heights += [*[1.1] * len(fingers), *[1.15] * len(lines[1:])]
     figure = Figure(figsize=(WIDTH_IN, sum(heights) + 0.42 * len(heights) + 0.5), dpi=DPI, layout="constrained")
     figure.suptitle(_title(contents), x=0.01, ha="left", fontsize=11)
     axes: list[Any] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     )
     if lines:
-        main = axes.pop(0)
-        _draw_panel(main, lines[0], start_ns)
+        touch_axes = axes.pop(0)
+        _draw_panel(touch_axes, lines[0], start_ns)
         for span in contents.spans:
             if span.lane == CONTACT:
                 style = _style(span, drawing.DISTINCT[0])
-                main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **style)
+                touch_axes.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **style)
     if lanes:
         _draw_lanes(axes.pop(0), lanes, start_ns)
     for strip in strips:
         _draw_strip(axes.pop(0), strip, start_ns)
-    for finger in touched:
+    for finger in fingers:
         _draw_taxels(axes.pop(0), finger, start_ns, stop_ns)
     for panel in lines[1:]:
         _draw_panel(axes.pop(0), panel, start_ns)
     bottom = figure.axes[-1]
     bottom.set_xlabel("time since the start of the recording (s)")
     bottom.set_xlim(0, max(_s(stop_ns, start_ns), 1e-3))
-    for axis_of_figure in figure.axes:
+    for panel_axes in figure.axes:
         for event in contents.events:
-            axis_of_figure.axvline(_s(event.t_ns, start_ns), color=drawing.FAULT, linewidth=0.8, alpha=0.8)
+            panel_axes.axvline(_s(event.t_ns, start_ns), color=drawing.FAULT, linewidth=0.8, alpha=0.8)
     return figure
 
 
@@ -129,8 +130,8 @@ def _draw_strip(axes: Any, strip: FrameStrip, start_ns: int) -> None:
     first_s, last_s = _s(strip.ends_ns, start_ns).tolist()
     step_s = max(last_s - first_s, 1e-3) / STRIP_FRAMES
     for t_ns, image in zip(strip.t_ns.tolist(), strip.images, strict=True):
-        place = min(int((_s(t_ns, start_ns) - first_s) / step_s), STRIP_FRAMES - 1)
-        left_s = first_s + place * step_s
+        interval = min(int((_s(t_ns, start_ns) - first_s) / step_s), STRIP_FRAMES - 1)
+        left_s = first_s + interval * step_s
         pixel_step = max(1, image.shape[1] // STRIP_PX)
         axes.imshow(image[::pixel_step, ::pixel_step], aspect="auto", extent=(left_s, left_s + 0.98 * step_s, 0, 1))
     axes.set_ylim(0, 1)
@@ -157,11 +158,12 @@ def _lanes(contents: DrawnContents) -> dict[str, list[Span]]:
 
 
 def _draw_panel(axes: Any, panel: Panel, start_ns: int) -> None:
+    """Draw the curves of a panel, as their envelope if they have many points, with a legend."""
     t_ns, values = envelope(panel.t_ns, panel.values, MAX_POINTS)
     seconds = _s(t_ns, start_ns)
-    vector = set(panel.names) <= set("xyzw")
+    is_vector = set(panel.names) <= set("xyzw")
     for index, name in enumerate(panel.names):
-        colour = drawing.indexed_colour(index, drawing.AXES if vector else drawing.PRINTED)
+        colour = drawing.indexed_colour(index, drawing.AXES if is_vector else drawing.PRINTED)
         axes.plot(seconds, values[:, index], color=colour, linewidth=LINE, label=name if index < MAX_LEGEND else None)
     axes.set_title(panel.title, loc="left")
     axes.grid(alpha=0.25)

@@ -36,25 +36,26 @@ class MarkerTrack:
 def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequence[Step]) -> MarkerTrack | None:
     """Return the markers of a stream of displacements in the frames of the stream of the same name of ``video``.
 
-    Returns None if the stream contains no marker displacements, or ``video`` has no such frames. The markers at rest
-    are found in the first frame, as in `extract markers`.
+    Returns None if the stream contains no marker displacements, or ``video`` has no such frames, or no grid of markers
+    is found. The markers at rest are found in the first frame, as in `extract markers`. Raises `TacpipeError` if the
+    frame cannot be decoded.
     """
     from tacpipe.video.decoding import read_frames
     from tacpipe.video.markers import find_grid
     from tacpipe.video.stream import read_format
 
-    places = _places(table)
-    if not places or TIME not in table.column_names or stream not in video.streams:
+    names_by_position = _names_by_position(table)
+    if not names_by_position or TIME not in table.column_names or stream not in video.streams:
         return None
     frames = video.columns(stream)
     if read_format(frames) is None or not frames.num_rows:
         return None
-    rows, columns = (max(place[axis] for place in places) for axis in (0, 1))
+    rows, columns = (max(place[axis] for place in names_by_position) for axis in (0, 1))
     grid = find_grid(read_frames(frames, [0], grey=True)[0], rows, columns)
     if grid is None:
         return None
     displacements = np.full((table.num_rows, rows * columns, 2), np.nan)
-    for (row, column, axis), name in places.items():
+    for (row, column, axis), name in names_by_position.items():
         values = table.column(name).to_numpy().astype(np.float64)
         displacements[:, (row - 1) * columns + column - 1, axis] = values
     pitch_mm = next((step["params"].get("pitch_mm") for step in chain if step["stage"] == STAGE), None)
@@ -63,13 +64,16 @@ def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequenc
     return MarkerTrack(stream, table.column(TIME).to_numpy(), grid.positions_px, grid.positions_px + displacements)
 
 
-def _places(table: pa.Table) -> Mapping[tuple[int, int, int], str]:
-    """Return the columns of displacements by row and column of the marker, from 1, and axis, from 0."""
-    places: dict[tuple[int, int, int], str] = {}
+def _names_by_position(table: pa.Table) -> Mapping[tuple[int, int, int], str]:
+    """Return the columns of displacements by row and column of the marker, from 1, and axis, from 0.
+
+    An empty mapping if a column of displacements has no row and column.
+    """
+    names: dict[tuple[int, int, int], str] = {}
     for field in table.schema:
-        about = field_metadata(field)
-        if about.get("quantity") == "tactile" and about.get("unit") in UNITS and about.get("axis") in AXES:
-            if not {"row", "column"} <= set(about):
+        metadata = field_metadata(field)
+        if metadata.get("quantity") == "tactile" and metadata.get("unit") in UNITS and metadata.get("axis") in AXES:
+            if not {"row", "column"} <= set(metadata):
                 return {}
-            places[int(about["row"]), int(about["column"]), AXES.index(about["axis"])] = field.name
-    return places
+            names[int(metadata["row"]), int(metadata["column"]), AXES.index(metadata["axis"])] = field.name
+    return names

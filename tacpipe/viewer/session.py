@@ -41,17 +41,18 @@ def write(
 ) -> list[Path]:
     """Write a Rerun file for each recording and return the paths; the viewer lists them by name below ``dataset``.
 
-    Lines of more than 30,000 rows are written as their envelope, unless ``all_rows``. ``with_list`` shows the list.
+    Lines of more than 30,000 rows are written as their envelope, unless ``all_rows``. ``with_list`` opens the panel
+    with the list. Raises `MissingModuleError` if Rerun is not installed.
     """
     import rerun as rr
 
     from tacpipe.viewer import stream
 
-    applications: dict[str, str] = {}
+    names_by_layout: dict[str, str] = {}
     paths = []
     for contents in recordings:
         layout = repr(signature(contents))
-        name = applications.setdefault(layout, application(dataset, len(applications)))
+        name = names_by_layout.setdefault(layout, application(dataset, len(names_by_layout)))
         paths.append(folder / f"{re.sub(UNSAFE, '-', contents.name)}{SUFFIX}")
         recording = rr.RecordingStream(name, recording_id=contents.name)
         recording.save(paths[-1])
@@ -124,17 +125,17 @@ def serve(files: Sequence[Path], port: int | None) -> Iterator[str]:
 
     Raises `TacpipeError` if the port is in use or the viewer does not start.
     """
-    data, assets = _free_port(), _free_port()
-    ports = ["--bind", HOST, "--port", str(data), "--web-viewer-port", str(assets)]
+    data_port, page_port = _free_port(), _free_port()
+    ports = ["--bind", HOST, "--port", str(data_port), "--web-viewer-port", str(page_port)]
     command = [program(), *map(str, files), "--serve-web", *ports]
     with subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as viewer:
         try:
-            source = f"http://{HOST}:{assets}"
+            source = f"http://{HOST}:{page_port}"
             _wait_for_viewer(source, viewer)
-            server = _server(port, source)
+            server = _start_server(port, source)
             Thread(target=server.serve_forever, daemon=True).start()
             try:
-                url = quote(f"rerun+http://localhost:{data}/proxy", safe="")
+                url = quote(f"rerun+http://localhost:{data_port}/proxy", safe="")
                 yield f"http://{HOST}:{server.server_address[1]}/?url={url}"
             finally:
                 server.shutdown()
@@ -143,7 +144,11 @@ def serve(files: Sequence[Path], port: int | None) -> Iterator[str]:
             viewer.terminate()
 
 
-def _server(port: int | None, source: str) -> ThreadingHTTPServer:
+def _start_server(port: int | None, source: str) -> ThreadingHTTPServer:
+    """Return a server on the port, or on `PORT` or a free one for None, that forwards the viewer's page at ``source``.
+
+    Raises `TacpipeError` if the given port cannot be used.
+    """
     handler = type("Handler", (_Handler,), {"source": source})
     try:
         return ThreadingHTTPServer((HOST, PORT if port is None else port), handler)
@@ -154,6 +159,10 @@ def _server(port: int | None, source: str) -> ThreadingHTTPServer:
 
 
 def _wait_for_viewer(source: str, viewer: subprocess.Popen[bytes]) -> None:
+    """Wait until the viewer answers at the address ``source``.
+
+    Raises `TacpipeError` if it ends or `TIMEOUT_S` have passed.
+    """
     deadline_s = time.monotonic() + TIMEOUT_S
     while viewer.poll() is None and time.monotonic() < deadline_s:
         with suppress(OSError), urllib.request.urlopen(source, timeout=TIMEOUT_S):
@@ -175,7 +184,7 @@ SHORT_S, LOOP_S = 20.0, 10.0  # a recording up to this length plays in full; dur
 
 
 def signature(contents: DrawnContents) -> tuple[Any, ...]:
-    """Return the properties that determine the layout; recordings with the same ones share it."""
+    """Return the properties that determine the layout; recordings with equal properties share it."""
     titles = (
         sorted(f"{curve.stream} {curve.title}" for curve in contents.curves),
         sorted(finger.name for finger in contents.taxels),
@@ -190,7 +199,7 @@ def signature(contents: DrawnContents) -> tuple[Any, ...]:
 
 
 def blueprint(contents: DrawnContents, *, with_list: bool = False) -> Any:
-    """Return the layout of a recording's views as a Rerun blueprint."""
+    """Return the layout of a recording's views as a Rerun blueprint; ``with_list`` opens the list of recordings."""
     import rerun.blueprint as rrb
 
     left, right = _time_views(contents), _cursor_views(contents)
@@ -200,14 +209,8 @@ def blueprint(contents: DrawnContents, *, with_list: bool = False) -> Any:
         root = rrb.Horizontal(_space_views(contents)[0], _stack(right), column_shares=[1, 1.2])
     else:
         root = _space_views(contents)[0]
-    return rrb.Blueprint(
-        root,
-        _time_panel(contents),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(
-            state="expanded" if with_list else "collapsed"
-        ),  # this panel contains the list of recordings
-    )
+    recording_list = rrb.BlueprintPanel(state="expanded" if with_list else "collapsed")
+    return rrb.Blueprint(root, _time_panel(contents), rrb.SelectionPanel(state="hidden"), recording_list)
 
 
 def _time_panel(contents: DrawnContents) -> Any:
@@ -247,14 +250,14 @@ def _stack(parts: list[tuple[Any, float]]) -> Any:
 
 
 def _time_views(contents: DrawnContents) -> list[tuple[Any, float]]:
-    """Return the views with a time axis, and their heights."""
+    """Return the views with a time axis, and their heights relative to each other."""
     import rerun.blueprint as rrb
 
     views: list[tuple[Any, float]] = []
     unit = f" ({_unit(contents)})".replace(" ()", "")
-    ahead = [forecast for forecast in contents.forecasts if forecast.step]
-    if ahead:
-        for name in dict.fromkeys(forecast.measured.name for forecast in ahead):
+    future_forecasts = [forecast for forecast in contents.forecasts if forecast.step]
+    if future_forecasts:
+        for name in dict.fromkeys(forecast.measured.name for forecast in future_forecasts):
             title = f"{name}: load measured and predicted{unit}"
             views.append((_plot(_origin(stream.FORECAST, name), title), 2.0))
         views.append((_plot(stream.ERROR, f"Mean absolute error of the forecasts{unit}"), 1.3))
@@ -319,6 +322,7 @@ def _space_view(contents: DrawnContents) -> Any:
 
 
 def _carpet_view(contents: DrawnContents) -> Any:
+    """Return the view of all taxels over the recording, see `stream.RerunStream`."""
     import rerun.blueprint as rrb
 
     width, height = stream.carpet_size(contents)
@@ -327,7 +331,7 @@ def _carpet_view(contents: DrawnContents) -> Any:
 
 
 def _cursor_views(contents: DrawnContents) -> list[tuple[Any, float]]:
-    """Return the views of the moment at the cursor, and their heights."""
+    """Return the views of the moment at the cursor, and their heights relative to each other."""
     import rerun.blueprint as rrb
 
     views: list[tuple[Any, float]] = []
@@ -346,7 +350,7 @@ def _cursor_views(contents: DrawnContents) -> list[tuple[Any, float]]:
 
 
 def _space_views(contents: DrawnContents) -> tuple[Any, float]:
-    """Return the tabs of space, cameras, and the recording's labels, and their height."""
+    """Return the tabs of space, cameras and the recording's labels as one view, and its relative height."""
     import rerun.blueprint as rrb
 
     views: list[Any] = [_space_view(contents)] if contents.paths or contents.clouds else []
@@ -361,6 +365,7 @@ def _space_views(contents: DrawnContents) -> tuple[Any, float]:
 
 
 def _map_view(name: str, finger: Taxels, contents: DrawnContents) -> Any:
+    """Return the view of a map of taxels, measured or predicted, with the map's title and bounds."""
     import rerun.blueprint as rrb
 
     x, y = stream.map_bounds(finger)
@@ -371,13 +376,13 @@ def _map_view(name: str, finger: Taxels, contents: DrawnContents) -> Any:
 
 
 def _maps(contents: DrawnContents) -> list[tuple[str, Taxels]]:
-    """Return the maps by name, of measured taxels and of predictions."""
-    names = []
+    """Return the maps of measured taxels and of predictions: the name of each, and the finger."""
+    maps = []
     for finger in contents.taxels:
-        names.append((finger.name, finger))
+        maps.append((finger.name, finger))
         steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
-        names += [(stream.map_name(finger.name, compared, max(steps)), finger) for compared in stream.COMPARED if steps]
-    return names
+        maps += [(stream.map_name(finger.name, compared, max(steps)), finger) for compared in stream.COMPARED if steps]
+    return maps
 
 
 def _unit(contents: DrawnContents) -> str:
@@ -391,8 +396,8 @@ def _map_title(name: str, finger: Taxels, contents: DrawnContents) -> str:
     steps = [forecast.step for forecast in contents.forecasts if forecast.measured.name == finger.name]
     if not steps or name == finger.name:
         return name if contents.forecasts else f"{name} ({finger.unit})".replace(" ()", "")
-    ahead = f"t+{max(steps)}" if max(steps) else "predicted"
-    return ahead if name == stream.map_name(finger.name, stream.COMPARED[0], max(steps)) else f"error {ahead}"
+    predicted = f"t+{max(steps)}" if max(steps) else "predicted"
+    return predicted if name == stream.map_name(finger.name, stream.COMPARED[0], max(steps)) else f"error {predicted}"
 
 
 def _plot(origin: str, name: str) -> Any:

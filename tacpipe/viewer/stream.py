@@ -47,91 +47,96 @@ class RerunStream:
         self._recording, self._start_ns, self._all_rows = recording, start_ns, all_rows
 
     def send(self, contents: DrawnContents) -> None:
-        """Write all contents of a recording."""
+        """Write all contents of a recording to the stream."""
         for index, finger in enumerate(contents.taxels):
-            self._touch(finger, index)
-            self._channels(finger)
+            self._write_touch(finger, index)
+            self._write_channels(finger)
         for name, members in group_by_scale(contents.taxels).items():
-            self._maps(name, members)
-        self._forecasts(contents.forecasts)
-        self._carpet(contents)
+            self._write_maps(name, members)
+        self._write_forecasts(contents.forecasts)
+        self._write_carpet(contents)
         for curves in contents.curves:
-            self._curves((SERIES, curves.stream, curves.title), curves)
+            self._write_curves((SERIES, curves.stream, curves.title), curves)
         for curves in contents.truth:
-            self._curves((TRUTH, curves.title), curves)
-        self._spans(contents)
+            self._write_curves((TRUTH, curves.title), curves)
+        self._write_spans(contents)
         for path in contents.paths:
-            self._path(path)
-        self._clouds(contents.clouds)
+            self._write_path(path)
+        self._write_clouds(contents.clouds)
         for frames in contents.frames:
-            self._frames(frames)
+            self._write_frames(frames)
         for track in contents.markers:
-            self._markers(track)
+            self._write_markers(track)
         if contents.classification is not None:
-            self._scores(contents.classification)
-        self._static((ABOUT,), _rerun().TextDocument(to_markdown(contents), media_type="text/markdown"))
+            self._write_scores(contents.classification)
+        self._log_static((ABOUT,), _rerun().TextDocument(to_markdown(contents), media_type="text/markdown"))
 
     def _time_column(self, t_ns: AnyArray) -> Any:
         elapsed = (np.asarray(t_ns, np.int64) - self._start_ns).astype("timedelta64[ns]")
         return _rerun().TimeColumn(TIMELINE, duration=elapsed)
 
-    def _static(self, parts: Sequence[str], *components: Any) -> None:
+    def _log_static(self, parts: Sequence[str], *components: Any) -> None:
         self._recording.log(list(parts), *components, static=True)
 
-    def _columns(self, parts: Sequence[str], t_ns: AnyArray, columns: Any) -> None:
+    def _send_columns(self, parts: Sequence[str], t_ns: AnyArray, columns: Any) -> None:
         path = _rerun().new_entity_path(list(parts))
         self._recording.send_columns(path, [self._time_column(t_ns)], columns)
 
-    def _lines(
+    def _write_lines(
         self, parts: Sequence[str], t_ns: Times, values: Floats, names_and_colours: Sequence[tuple[str, str]]
     ) -> None:
-        """Write values (time, channel) as the lines of one plot, each with a name and a colour."""
-        rr = _rerun()
-        names, colours = (
-            [name for name, _ in names_and_colours],
-            [drawing.rgb(colour) for _, colour in names_and_colours],
-        )
-        if not self._all_rows:
-            t_ns, values = envelope(t_ns, values, MAX_ROWS)
-        self._static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(names_and_colours)))
-        self._columns(parts, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(values)))
+        """Write values (time, channel) as the lines of one plot, each with a name and a colour.
 
-    def _curves(self, parts: Sequence[str], curves: Curves) -> None:
+        They are reduced to their envelope unless all rows are written.
+        """
+        rr = _rerun()
+        names = [name for name, _ in names_and_colours]
+        colours = [drawing.rgb(colour) for _, colour in names_and_colours]
+        drawn_ns, drawn = (t_ns, values) if self._all_rows else envelope(t_ns, values, MAX_ROWS)
+        self._log_static(parts, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(names_and_colours)))
+        self._send_columns(parts, drawn_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(drawn)))
+
+    def _write_curves(self, parts: Sequence[str], curves: Curves) -> None:
         are_axes = curves.names in (tuple("xyz"), tuple("xyzw"), tuple("xy"))
         colours = drawing.AXES if are_axes else drawing.DISTINCT
         names_and_colours = [(name, drawing.indexed_colour(index, colours)) for index, name in enumerate(curves.names)]
-        self._lines(parts, curves.t_ns, curves.values, names_and_colours)
+        self._write_lines(parts, curves.t_ns, curves.values, names_and_colours)
 
-    def _touch(self, finger: Taxels, place: int) -> None:
+    def _write_touch(self, finger: Taxels, place: int) -> None:
         if len(finger.t_ns) > 1:
-            self._lines(
+            self._write_lines(
                 (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.indexed_colour(place))]
             )
 
-    def _channels(self, finger: Taxels) -> None:
+    def _write_channels(self, finger: Taxels) -> None:
         """Write the change of each taxel, one plot per axis."""
         if len(finger.t_ns) < 2:
             return
         names_and_colours = [(name, drawing.indexed_colour(index)) for index, name in enumerate(finger.names)]
         for axis, name in enumerate(AXES if finger.change.shape[2] == 3 else ("",)):
             parts = (CHANNELS, finger.name, channels_title(finger, name))
-            self._lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
+            self._write_lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
 
-    def _maps(self, group: str, fingers: Sequence[Taxels]) -> None:
-        """Write the maps of fingers that share a scale of colours and arrows."""
+    def _write_maps(self, group: str, fingers: Sequence[Taxels]) -> None:
+        """Write the maps of a group of fingers, see `group_by_scale`, which share a scale of colours and arrows."""
         low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
         shear = np.concatenate([np.linalg.norm(finger.change[:, :, :2], axis=2).ravel() for finger in fingers])
         longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE) if group == "3" else 1.0
         for finger in fingers:
-            self._map((MAPS, finger.name), finger, low, high, longest)
+            self._write_map((MAPS, finger.name), finger, low, high, longest)
 
-    def _map(self, parts: tuple[str, ...], finger: Taxels, low: float, high: float, longest: float) -> None:
-        """Write a map of taxels: discs coloured by the change from rest, with arrows for the shear along x and y."""
+    def _write_map(self, parts: tuple[str, ...], finger: Taxels, low: float, high: float, longest: float) -> None:
+        """Write a map of taxels: discs coloured by the change from rest, with arrows for the shear along x and y.
+
+        Colours range from ``low`` to ``high``; a shear of ``longest`` has an arrow of almost the pitch.
+        """
         rr = _rerun()
         pitch = spacing(finger.places)
-        place = finger.places * (1, -1)  # pixel coordinates increase downwards
-        self._static((*parts, "discs"), rr.Points2D(place, radii=0.42 * pitch, labels=finger.names, show_labels=False))
-        self._write_colour_scale((*parts, "scale"), place, pitch, low, high, finger.unit)
+        positions = finger.places * (1, -1)  # pixel coordinates increase downwards
+        self._log_static(
+            (*parts, "discs"), rr.Points2D(positions, radii=0.42 * pitch, labels=finger.names, show_labels=False)
+        )
+        self._write_colour_scale((*parts, "scale"), positions, pitch, low, high, finger.unit)
         rows = _display_rows(finger.t_ns)
         t_ns, change, magnitude = finger.t_ns[rows], finger.change[rows], finger.magnitude[rows]
         if len(rows) > 1 and t_ns[0] > self._start_ns:  # the change is unknown before the first row
@@ -139,26 +144,26 @@ class RerunStream:
             change, magnitude = (np.concatenate([np.zeros_like(values[:1]), values]) for values in (change, magnitude))
         colours = _pack_colours(drawing.map_colours(magnitude, low, high))  # (time, taxel)
         count = [colours.shape[1]] * len(colours)
-        vectors = finger.change.shape[2] == 3
-        arrows = change[:, :, :2] * (1, -1) * (0.9 * pitch / longest) if vectors else None
-        style = {"origins": place, "colors": [(255, 255, 255)], "radii": 0.05 * pitch, "draw_order": 50.0}
+        has_axes = finger.change.shape[2] == 3
+        arrows = change[:, :, :2] * (1, -1) * (0.9 * pitch / longest) if has_axes else None
+        style = {"origins": positions, "colors": [(255, 255, 255)], "radii": 0.05 * pitch, "draw_order": 50.0}
         if len(colours) == 1:  # a single reading is valid for the full recording
-            self._static((*parts, "discs"), rr.Points2D.from_fields(colors=colours.ravel()))
+            self._log_static((*parts, "discs"), rr.Points2D.from_fields(colors=colours.ravel()))
             if arrows is not None:
-                self._static((*parts, "shear"), rr.Arrows2D(vectors=arrows[0], **style))
+                self._log_static((*parts, "shear"), rr.Arrows2D(vectors=arrows[0], **style))
             return
-        self._columns((*parts, "discs"), t_ns, rr.Points2D.columns(colors=colours.ravel()).partition(count))
+        self._send_columns((*parts, "discs"), t_ns, rr.Points2D.columns(colors=colours.ravel()).partition(count))
         if arrows is not None:
-            self._static((*parts, "shear"), rr.Arrows2D.from_fields(**style))
+            self._log_static((*parts, "shear"), rr.Arrows2D.from_fields(**style))
             flat = rr.Arrows2D.columns(vectors=np.ascontiguousarray(arrows, np.float32).reshape(-1, 2)).partition(count)
-            self._columns((*parts, "shear"), t_ns, flat)
+            self._send_columns((*parts, "shear"), t_ns, flat)
 
     def _write_colour_scale(
-        self, parts: Sequence[str], place: Floats, pitch: float, low: float, high: float, unit: str
+        self, parts: Sequence[str], positions: Floats, pitch: float, low: float, high: float, unit: str
     ) -> None:
-        """Write a colour scale below a map, labelled with its lowest and highest values."""
+        """Write a colour scale below a map of discs at positions (taxel, xy), labelled with its lowest and highest value."""
         rr = _rerun()
-        left, right, bottom = place[:, 0].min(), place[:, 0].max(), place[:, 1].max() + 1.3 * pitch
+        left, right, bottom = positions[:, 0].min(), positions[:, 0].max(), positions[:, 1].max() + 1.3 * pitch
         x = np.linspace(left, right, RAMP)
         boxes = rr.Boxes2D(
             centers=np.column_stack([x, np.full(RAMP, bottom)]),
@@ -168,38 +173,38 @@ class RerunStream:
         )
         ends = [f"{low:,.4g}", f"{high:,.4g} {unit}".strip()]
         text = _labels([(left + 0.2 * pitch, bottom + 0.4 * pitch), (right - 0.6 * pitch, bottom + 0.4 * pitch)], ends)
-        self._static((*parts, "ramp"), boxes)
-        self._static((*parts, "ends"), text)
+        self._log_static((*parts, "ramp"), boxes)
+        self._log_static((*parts, "ends"), text)
 
-    def _forecasts(self, forecasts: Sequence[DrawnForecast]) -> None:
-        """Write measured and predicted load of each finger, the errors, and the maps of the last step."""
+    def _write_forecasts(self, forecasts: Sequence[DrawnForecast]) -> None:
+        """Write measured and predicted load of each finger, the errors, and the maps of the last step and of its errors."""
         for name in dict.fromkeys(member.measured.name for member in forecasts):
             steps = [member for member in forecasts if member.measured.name == name]
             last = steps[-1]
             if last.step:
-                self._errors(name, steps)
+                self._write_errors(name, steps)
             magnitudes = np.concatenate([last.predicted.magnitude.ravel(), last.measured.magnitude.ravel()])
             low, high = taxels.scale(magnitudes)
             shear = np.linalg.norm(last.measured.change[:, :, :2], axis=2)
             longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE)
             predicted, residual = (map_name(name, compared, last.step) for compared in COMPARED)
-            self._map((MAPS, predicted), last.predicted, low, high, longest)
+            self._write_map((MAPS, predicted), last.predicted, low, high, longest)
             low, high = taxels.scale(last.residual.magnitude)  # a separate scale, so that small errors are visible
-            self._map((MAPS, residual), last.residual, low, high, max(high, taxels.MIN_SCALE))
+            self._write_map((MAPS, residual), last.residual, low, high, max(high, taxels.MIN_SCALE))
 
-    def _errors(self, name: str, steps: Sequence[DrawnForecast]) -> None:
+    def _write_errors(self, name: str, steps: Sequence[DrawnForecast]) -> None:
         """Write the measured load of a finger, the predicted load at each step, and the errors."""
         measured_line, last = [("measured", drawing.MEASURED)], steps[-1].measured
-        self._lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
+        self._write_lines((FORECAST, name, "measured"), last.t_ns, last.load[:, None], measured_line)
         for index, forecast in enumerate(steps):
             names_and_colours = [(f"t+{forecast.step}", drawing.indexed_colour(index))]
             parts = (name, names_and_colours[0][0])
-            self._lines(
+            self._write_lines(
                 (FORECAST, *parts), forecast.predicted.t_ns, forecast.predicted.load[:, None], names_and_colours
             )
-            self._lines((ERROR, *parts), forecast.predicted.t_ns, forecast.error[:, None], names_and_colours)
+            self._write_lines((ERROR, *parts), forecast.predicted.t_ns, forecast.error[:, None], names_and_colours)
 
-    def _carpet(self, contents: DrawnContents) -> None:
+    def _write_carpet(self, contents: DrawnContents) -> None:
         """Write all taxels over the full recording as one image, with a line at the cursor."""
         rr = _rerun()
         fingers = [finger for finger in contents.taxels if len(finger.t_ns) > 1]
@@ -216,17 +221,18 @@ class RerunStream:
             top += parts[-1].shape[0] + rows
             parts.append(np.zeros((rows, BINS, 3), np.uint8))
         picture = np.concatenate(parts[:-1])
-        self._static((CARPET, "image"), rr.Image(picture))
+        self._log_static((CARPET, "image"), rr.Image(picture))
         names = _labels([(BINS / 2, y) for _, y in labels], [name for name, _ in labels])
-        self._static((CARPET, "names"), names)
+        self._log_static((CARPET, "names"), names)
         cursor_ns = start_ns + np.linspace(0, stop_ns - start_ns, BINS).astype(np.int64)
         strips = np.zeros((BINS, 2, 2), np.float32)
         strips[:, :, 0] = np.arange(BINS)[:, None]
         strips[:, 1, 1] = picture.shape[0]
-        self._static((CARPET, "cursor"), rr.LineStrips2D.from_fields(colors=[(255, 255, 255)], radii=1.0))
-        self._columns((CARPET, "cursor"), cursor_ns, rr.LineStrips2D.columns(strips=list(strips)))
+        self._log_static((CARPET, "cursor"), rr.LineStrips2D.from_fields(colors=[(255, 255, 255)], radii=1.0))
+        self._send_columns((CARPET, "cursor"), cursor_ns, rr.LineStrips2D.columns(strips=list(strips)))
 
-    def _spans(self, contents: DrawnContents) -> None:
+    def _write_spans(self, contents: DrawnContents) -> None:
+        """Write contacts, labels, gaps and events as lanes of spans, and the texts of events."""
         start_ns, stop_ns = contents.ends_ns
         width_ns = int((stop_ns - start_ns) * EVENT_WIDTH)
         event_spans = [
@@ -238,60 +244,66 @@ class RerunStream:
             lanes.setdefault(span.lane, []).append(span)
         for index, (lane, spans) in enumerate(lanes.items()):
             is_fault = lane == "gaps" or lane.startswith("events")
-            self._lane(lane, spans, drawing.FAULT if is_fault else drawing.indexed_colour(index))
+            self._write_lane(lane, spans, drawing.FAULT if is_fault else drawing.indexed_colour(index))
         if contents.events:
             rr = _rerun()
-            at_ns = np.array([event.t_ns for event in contents.events])
+            events_ns = np.array([event.t_ns for event in contents.events])
             texts = [f"{event.stream}: {event.text}" for event in contents.events]
-            self._columns((EVENTS,), at_ns, rr.TextLog.columns(text=texts, level=["WARN"] * len(texts)))
+            self._send_columns((EVENTS,), events_ns, rr.TextLog.columns(text=texts, level=["WARN"] * len(texts)))
 
-    def _lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
+    def _write_lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
+        """Write the spans of one lane as states over time, in shades of a colour; padding is grey."""
         rr = _rerun()
         t_ns, states = state_changes(spans)
         labels = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
         colours = [drawing.rgb(colour)] * len(labels) if len(labels) < 2 else _shades(colour, len(labels))
         values = [*labels, PADDING] if PADDING in states else labels
         colours += [drawing.rgb(drawing.MEASURED)] * (len(values) - len(labels))
-        self._static((SPANS, lane), rr.StateConfiguration(values=values, labels=values, colors=colours))
-        self._columns((SPANS, lane), t_ns, rr.StateChange.columns(state=states))
+        self._log_static((SPANS, lane), rr.StateConfiguration(values=values, labels=values, colors=colours))
+        self._send_columns((SPANS, lane), t_ns, rr.StateChange.columns(state=states))
 
-    def _path(self, path: Path) -> None:
+    def _write_path(self, path: Path) -> None:
+        """Write a path as a line, with a point at its current position, and its axes if orientations are known.
+
+        A path with a single time is a labelled point.
+        """
         rr = _rerun()
         parts = (SPACE, path.name)
         colour = drawing.rgb(drawing.colour_for(path.name))
         if len(path.t_ns) == 1:
             style = {"radii": rr.Radius.ui_points(7), "colors": [colour], "labels": [path.name]}
-            self._static(parts, rr.Points3D(path.position_m, **style))
+            self._log_static(parts, rr.Points3D(path.position_m, **style))
             return
         line = path.position_m[_evenly_spaced_rows(len(path.t_ns), POINTS)]
-        self._static((*parts, "path"), rr.LineStrips3D([line], colors=[colour], radii=rr.Radius.ui_points(1.5)))
+        self._log_static((*parts, "path"), rr.LineStrips3D([line], colors=[colour], radii=rr.Radius.ui_points(1.5)))
         rows = _display_rows(path.t_ns)
         columns = {"translation": path.position_m[rows]}
         if path.quaternion is not None:
             columns["quaternion"] = path.quaternion[rows]
-        self._columns((*parts, "now"), path.t_ns[rows], rr.Transform3D.columns(**columns))
-        self._static((*parts, "now"), rr.Points3D([(0, 0, 0)], radii=rr.Radius.ui_points(6), colors=[colour]))
+        self._send_columns((*parts, "now"), path.t_ns[rows], rr.Transform3D.columns(**columns))
+        self._log_static((*parts, "now"), rr.Points3D([(0, 0, 0)], radii=rr.Radius.ui_points(6), colors=[colour]))
         if path.quaternion is not None:
             reach_m = max(0.1 * float(np.ptp(path.position_m, axis=0).max()), 0.01)
-            self._static((*parts, "now"), rr.TransformAxes3D(axis_length=reach_m))
+            self._log_static((*parts, "now"), rr.TransformAxes3D(axis_length=reach_m))
 
-    def _clouds(self, clouds: Sequence[Points]) -> None:
+    def _write_clouds(self, clouds: Sequence[Points]) -> None:
+        """Write clouds of points, each from its time on; one without time is always visible."""
         rr = _rerun()
         for points in clouds:
             drawn = rr.Points3D(points.points_m, colors=points.colours, radii=rr.Radius.ui_points(2))
             if points.t_ns is None:
-                self._static((SPACE, points.stream), drawn)
+                self._log_static((SPACE, points.stream), drawn)
             else:
                 self._recording.set_time(TIMELINE, duration=np.timedelta64(points.t_ns - self._start_ns, "ns"))
                 self._recording.log([SPACE, points.stream], drawn)
 
-    def _frames(self, frames: Frames) -> None:
+    def _write_frames(self, frames: Frames) -> None:
         rr = _rerun()
         parts = (CAMERAS, frames.stream)
-        self._static(parts, rr.EncodedImage.from_fields(media_type=frames.media_type))
-        self._columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
+        self._log_static(parts, rr.EncodedImage.from_fields(media_type=frames.media_type))
+        self._send_columns(parts, frames.t_ns, rr.EncodedImage.columns(blob=frames.content))
 
-    def _markers(self, track: MarkerTrack) -> None:
+    def _write_markers(self, track: MarkerTrack) -> None:
         """Write the markers of a gel over its frames, with arrows from rest, `ARROW_GAIN` times the displacement."""
         rr = _rerun()
         seen = ~np.isnan(track.positions_px).any(axis=2)  # (time, marker)
@@ -301,28 +313,28 @@ class RerunStream:
         vectors = ARROW_GAIN * (positions - origins)
         points, arrows = (CAMERAS, track.stream, "markers"), (CAMERAS, track.stream, "displacement")
         colour = drawing.rgb(drawing.DISTINCT[0])
-        self._static(points, rr.Points2D.from_fields(radii=rr.Radius.ui_points(3), colors=[(255, 255, 255)]))
-        self._columns(points, track.t_ns, rr.Points2D.columns(positions=positions).partition(counts))
-        self._static(arrows, rr.Arrows2D.from_fields(radii=rr.Radius.ui_points(1.5), colors=[colour]))
+        self._log_static(points, rr.Points2D.from_fields(radii=rr.Radius.ui_points(3), colors=[(255, 255, 255)]))
+        self._send_columns(points, track.t_ns, rr.Points2D.columns(positions=positions).partition(counts))
+        self._log_static(arrows, rr.Arrows2D.from_fields(radii=rr.Radius.ui_points(1.5), colors=[colour]))
         columns = rr.Arrows2D.columns(origins=origins, vectors=vectors).partition(counts)
-        self._columns(arrows, track.t_ns, columns)
+        self._send_columns(arrows, track.t_ns, columns)
 
-    def _scores(self, prediction: Classification) -> None:
+    def _write_scores(self, prediction: Classification) -> None:
         """Write a bar of the length of the score for each class; the model's class is bright, and the label is marked."""
         rr = _rerun()
         chosen = prediction.leading_scores()
         scores = np.array(list(chosen.values()))
-        row = np.arange(len(chosen), dtype=np.float64)
-        ends = np.column_stack([bar_lengths(scores), row])
+        rows = np.arange(len(chosen), dtype=np.float64)
+        ends = np.column_stack([bar_lengths(scores), rows])
         colours = [drawing.rgb(drawing.DISTINCT[0] if name == prediction.model_class else BAR) for name in chosen]
-        strips = [[(0.0, place), tuple(end)] for place, end in zip(row, ends, strict=True)]
-        self._static((NAMED, "bars"), rr.LineStrips2D(strips, radii=0.3, colors=colours))
+        strips = [[(0.0, row), tuple(end)] for row, end in zip(rows, ends, strict=True)]
+        self._log_static((NAMED, "bars"), rr.LineStrips2D(strips, radii=0.3, colors=colours))
         marked = (f"{name} (label)" if name == prediction.label else name for name in chosen)
         texts = [f"{name}   {score:.3g}" for name, score in zip(marked, scores, strict=True)]
         above = NAMES_RISE  # the viewer draws a text below its position
-        self._static((NAMED, "names"), _labels([(-NAMES_WIDTH / 2, at - above) for at in row], texts))
+        self._log_static((NAMED, "names"), _labels([(-NAMES_WIDTH / 2, row - above) for row in rows], texts))
         middle = (BARS_WIDTH - NAMES_WIDTH) / 2
-        self._static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [prediction.sentence]))
+        self._log_static((NAMED, "sentence"), _labels([(middle, -1.2 - above)], [prediction.sentence]))
 
 
 def bar_lengths(scores: Floats) -> Floats:
@@ -356,7 +368,10 @@ def carpet_size(contents: DrawnContents) -> tuple[int, int]:
 
 
 def group_by_scale(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
-    """Group fingers with the same unit and number of axes, which share a scale, by the number of axes (and the unit)."""
+    """Return fingers with the same unit and number of axes, which share a scale, by the number of axes.
+
+    A second unit with the same number of axes has the key "axes unit".
+    """
     shared: dict[tuple[int, str], list[Taxels]] = {}
     for member in fingers:
         shared.setdefault((member.change.shape[2], member.unit), []).append(member)
@@ -377,18 +392,18 @@ def state_changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
 
     Adjacent spans leave no gap between them; a span that starts before another ends cuts it off.
 
-    >>> at, states = state_changes([Span("a", "x", 0, 5), Span("a", "y", 5, 7)])
-    >>> at.tolist(), states
+    >>> t_ns, states = state_changes([Span("a", "x", 0, 5), Span("a", "y", 5, 7)])
+    >>> t_ns.tolist(), states
     ([0, 5, 7], ['x', 'y', ''])
     """
-    at: dict[int, str] = {}
+    states: dict[int, str] = {}  # by time in ns
     for span in sorted(spans, key=lambda member: member.start_ns):
-        at[span.start_ns] = span.text
-        for later in [t_ns for t_ns in at if span.start_ns < t_ns < span.stop_ns]:
-            del at[later]
-        at.setdefault(span.stop_ns, "")
-    order = sorted(at)
-    return np.array(order, np.int64), [at[t_ns] for t_ns in order]
+        states[span.start_ns] = span.text
+        for covered_ns in [t_ns for t_ns in states if span.start_ns < t_ns < span.stop_ns]:
+            del states[covered_ns]
+        states.setdefault(span.stop_ns, "")
+    times_ns = sorted(states)
+    return np.array(times_ns, np.int64), [states[t_ns] for t_ns in times_ns]
 
 
 def spacing(places: Floats) -> float:

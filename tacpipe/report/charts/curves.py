@@ -49,7 +49,7 @@ def zoom() -> ChartParam:
 
 
 def whole_steps(values: Iterable[object]) -> ChartAxis:
-    """Return an axis, with ticks at integers if all values are integers, such as epochs and counts."""
+    """Return an axis with ticks only at integers if all numbers are integers, such as epochs; an empty one otherwise."""
     numbers = sorted({value for value in values if isinstance(value, int | float)})
     if not all(float(value).is_integer() for value in numbers):
         return {}
@@ -67,7 +67,7 @@ def y_of(name: str) -> ChartChannel:
 
 
 def diagonal_of(ends: Sequence[float]) -> Spec:
-    """Return a thin line x = y between two ends."""
+    """Return the layer of a thin line x = y between two ends."""
     return {
         "data": {"values": [{"x": short(end), "y": short(end)} for end in ends]},
         "mark": {"type": "line", "stroke": INK, "strokeWidth": 0.8},
@@ -87,7 +87,7 @@ def short(value: float) -> float | None:
 
 
 def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
-    """Return bars in the given order, the first ``marked`` in another colour."""
+    """Return a chart of bars in the given order with the titles of its axes, the first ``marked`` in another colour."""
     rows: list[DataRow] = [
         {"x": name, "y": short(value), "kept": index < marked} for index, (name, value) in enumerate(values.items())
     ]
@@ -149,19 +149,19 @@ def lines(
 ) -> Spec:
     """Return lines over x with their bands.
 
-    ``level`` is a horizontal line, ``shade`` a span of x, ``floor`` the lower end of y.
+    ``level`` is a horizontal line with its name, ``shade`` a span of x, ``floor`` the lower end of y.
 
     With ``diagonal``, two numbers, a thin line x = y is drawn between them. Charts with the same ``order`` of names
-    give each name the same colour.
+    give each name the same colour. ``points`` marks each point, ``log`` makes y logarithmic and disables the zoom.
     """
     names = list(order) or list(dict.fromkeys(curve.name for curve in curves if not curve.thin))
     values = [row for number, curve in enumerate(curves) for row in _rows(curve, number)]
-    across, up = _scales(values, log=log, floor=floor, diagonal=diagonal)
+    x_scale, y_scale = _scales(values, log=log, floor=floor, diagonal=diagonal)
     if points:
-        across["padding"] = up["padding"] = MARGIN
+        x_scale["padding"] = y_scale["padding"] = MARGIN
     base: ChartEncoding = {
-        "x": {"field": "x", "type": "quantitative", "title": x, "scale": across},
-        "y": {"field": "y", "type": "quantitative", "title": y, "scale": up},
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": x_scale},
+        "y": {"field": "y", "type": "quantitative", "title": y, "scale": y_scale},
         "color": _colour(names, {curve.name for curve in curves}),
         "detail": {"field": "run", "type": "nominal"},
         "opacity": _opacity(1, 0.07),
@@ -188,25 +188,25 @@ def lines(
 def _scales(
     values: Sequence[DataRow], *, log: bool, floor: float | None, diagonal: Sequence[float]
 ) -> tuple[ChartScale, ChartScale]:
-    """Return the scales of x and y."""
-    across: ChartScale = {"zero": False, "nice": False}
-    up: ChartScale = {"zero": False}
+    """Return the scales of x and y; ``floor`` and ``diagonal`` set their ends, as in `lines`."""
+    x_scale: ChartScale = {"zero": False, "nice": False}
+    y_scale: ChartScale = {"zero": False}
     if log:
-        up["type"] = "log"
+        y_scale["type"] = "log"
     if floor is not None:
-        described = [
+        plotted_values = [
             value for row in values for key in ("y", "low", "high") if isinstance(value := row.get(key), float)
         ]
-        up["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
+        y_scale["domain"] = [max(floor, min([0.0, *plotted_values])), max([0.05, *plotted_values])]
     if diagonal:  # points at its ends are not clipped
-        room = ROOM * (diagonal[1] - diagonal[0])
-        up["nice"] = False
-        up["domain"] = across["domain"] = [short(diagonal[0] - room), short(diagonal[1] + room)]
-    return across, up
+        margin = ROOM * (diagonal[1] - diagonal[0])
+        y_scale["nice"] = False
+        y_scale["domain"] = x_scale["domain"] = [short(diagonal[0] - margin), short(diagonal[1] + margin)]
+    return x_scale, y_scale
 
 
 def _colour(names: Sequence[str], drawn: Container[str]) -> ChartChannel:
-    """Return the colours of the drawn names, by their position among all names."""
+    """Return the colours of the drawn names, by their position among all names, so that charts agree."""
     drawn_names = [name for name in names if name in drawn]
     colours = [COLOURS[names.index(name) % len(COLOURS)] for name in drawn_names]
     return {
@@ -223,6 +223,7 @@ def _opacity(opacity: float, hidden: float) -> ChartChannel:
 
 
 def _span(shade: tuple[float, float]) -> Spec:
+    """Return the layer of a shaded span of x."""
     return {
         "data": {"values": [{"a": shade[0], "b": shade[1]}]},
         "mark": {"type": "rect", "opacity": 0.12, "fill": INK},
@@ -249,7 +250,7 @@ def _bands(base: ChartEncoding) -> Spec:
 
 
 def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
-    """Return the layer of lines: of single runs if ``thin``, else of all others."""
+    """Return the layer of lines: thin ones of single runs if ``thin``, else those of all other curves."""
     dashes: ChartScale = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
     encoding = base.copy()
     encoding["strokeDash"] = {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}
@@ -279,9 +280,9 @@ def _point_channels(base: ChartEncoding) -> ChartEncoding:
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
-    """Reduce a line to at most about ``count`` points: the minimum and maximum of each segment, in order.
+    """Return a line with at most about ``count`` points, x and y: the minimum and maximum of each segment, in order.
 
-    NaN, which interrupts a line, is retained if a segment contains nothing else.
+    NaN, which interrupts a line, is retained once per segment.
 
     >>> x, y = decimated(np.arange(1000.0), np.r_[np.zeros(500), 9.0, np.zeros(499)], 10)
     >>> len(x) <= 20, float(y.max())
@@ -289,33 +290,34 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
     """
     if len(x) <= count:
         return x, y
-    indices: list[int] = []
+    rows: list[int] = []
     for part in np.array_split(np.arange(len(x)), max(count // 2, 1)):
         defined = part[~np.isnan(y[part])]
         if len(defined) < len(part):
-            indices.append(int(part[np.isnan(y[part])][0]))
+            rows.append(int(part[np.isnan(y[part])][0]))
         if len(defined):
-            indices += sorted({int(defined[np.argmin(y[defined])]), int(defined[np.argmax(y[defined])])})
-    at = np.array(sorted(set(indices)))
-    return x[at], y[at]
+            rows += sorted({int(defined[np.argmin(y[defined])]), int(defined[np.argmax(y[defined])])})
+    kept_rows = np.array(sorted(set(rows)))
+    return x[kept_rows], y[kept_rows]
 
 
 def _rows(curve: Curve, number: int) -> list[DataRow]:
+    """Return the points of the curve with this ``number`` as rows, fewer if it has no band."""
     x, y = (np.asarray(part, np.float64) for part in (curve.x, curve.y))
-    bounds = [None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high)]
-    if bounds[0] is None:
+    low, high = (None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high))
+    if low is None:
         x, y = decimated(x, y)
     rows: list[DataRow] = []
-    for index, (at, value) in enumerate(zip(x, y, strict=True)):
+    for index, (x_value, y_value) in enumerate(zip(x, y, strict=True)):
         row: DataRow = {
             "name": curve.name,
             "run": number,
-            "x": short(at),
-            "y": short(value),
+            "x": short(x_value),
+            "y": short(y_value),
             "dashed": curve.dashed,
             "thin": curve.thin,
         }
-        if bounds[0] is not None and bounds[1] is not None and not np.isnan([bounds[0][index], bounds[1][index]]).any():
-            row |= {"low": short(bounds[0][index]), "high": short(bounds[1][index])}
+        if low is not None and high is not None and not np.isnan([low[index], high[index]]).any():
+            row |= {"low": short(low[index]), "high": short(high[index])}
         rows.append(row)
     return rows

@@ -53,7 +53,8 @@ def scatter(
 ) -> Spec:
     """Return points of rows with ``x``, ``y``, ``name`` (which sets the colour), and optionally ``shape`` and ``tip``.
 
-    With ``diagonal``, a line x = y is drawn.
+    With ``diagonal``, a line x = y is drawn, with ``level``, a named horizontal line. ``shapes`` are the possible
+    values of ``shape``, and ``order`` the names by which colours are chosen.
     """
     values = _shorten_numbers(rows)
     names = list(order) or sorted({str(row["name"]) for row in values})
@@ -92,7 +93,7 @@ def scatter(
 
 
 def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
-    """Return a layer of diamonds at points (name, x, y), which show their numbers under the cursor."""
+    """Return a layer of diamonds at points (name, x, y), which show their numbers under the pointer."""
     return {
         "data": {"values": [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]},
         "mark": {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1},
@@ -105,7 +106,7 @@ def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
 
 
 def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
-    """Return a layer of lines between two points (x, y), each with its name at the first point."""
+    """Return a layer of lines between pairs of points (name, (x, y), (x, y)), each with its name at the first point."""
     values: list[DataRow] = [
         {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
         for name, start, end in pairs
@@ -123,22 +124,21 @@ def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
 
 
 def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
-    """Return points in the plane with equal units on both axes, one panel per name.
+    """Return points in the plane with equal units on both axes, one panel per name, in this many columns.
 
-    Rows have x, y, panel, strength and text.
-
-    The colour shows a strength from -1 to 1; rows without ``text`` have no label.
+    Rows have ``x``, ``y``, ``panel``, ``strength`` (from -1 to 1, shown by the colour) and optionally ``text``, a
+    label; fields whose name starts with a capital letter are shown under the pointer.
     """
     values = _shorten_numbers(rows)
     xs, ys = ([float(row[key] or 0.0) for row in rows] for key in ("x", "y"))
-    room = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
-    ends = {
-        key: [round(min(coordinates) - room, 3), round(max(coordinates) + room, 3)]
+    margin = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
+    domains = {
+        key: [round(min(coordinates) - margin, 3), round(max(coordinates) + margin, 3)]
         for key, coordinates in (("x", xs), ("y", ys))
     }
-    tall = (ends["y"][1] - ends["y"][0]) / ((ends["x"][1] - ends["x"][0]) or 1.0)
+    height_by_width = (domains["y"][1] - domains["y"][0]) / ((domains["x"][1] - domains["x"][0]) or 1.0)
     x, y = (
-        ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": ends[key], "nice": False})
+        ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": domains[key], "nice": False})
         for key in ("x", "y")
     )
     has_texts = any("text" in row for row in values)
@@ -148,7 +148,7 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
     tips = [tip_of(name, name) for name in dict.fromkeys(key for row in values for key in row) if name[0].isupper()]
     for row in values:
         strength = float(row.pop("strength") or 0.0)
-        row["side"] = "c" if strength == 0 else "a" if strength > 0 else "b"
+        row["side"] = "a" if strength > 0 else "b" if strength < 0 else "c"
         row["opacity"] = short(min(1.0, 0.12 + 0.78 * abs(strength))) if strength else 0.35
     layer: list[Spec] = [
         {"mark": {"type": "circle", "size": size, "stroke": QUIET if has_texts else None, "strokeWidth": 0.5},
@@ -164,7 +164,7 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
                   "header": {"labelFontWeight": 600, "labelLimit": 0, "labelPadding": 2}},
         "spec": {"layer": layer, "view": {"stroke": None}},
         "spacing": 12,
-        "usermeta": {"tall": short(tall), "columns": columns},
+        "usermeta": {"tall": short(height_by_width), "columns": columns},
     }  # fmt: skip
 
 
@@ -193,24 +193,24 @@ class Dot:
 def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = None, row: int = 24) -> Spec:
     """Return a dot with its interval per predictor in the given order, one panel per question.
 
-    ``level`` draws a line in each.
+    ``level`` draws a line in the panel of each name, and ``row`` is the minimum height of a row in pixels.
 
     Dots far beyond the others are drawn as triangles at the end of the axis.
     """
     low, high = _ends(dots)
     panels = list(dict.fromkeys(estimate.panel for estimate in dots))
     lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
-    row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
+    row_height = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
     values: list[DataRow] = []
     for index, estimate in enumerate(dots):
-        off = estimate.mean < low or estimate.mean > high
+        is_outside = estimate.mean < low or estimate.mean > high
         values.append(
             {
                 "name": "\n".join(lines_by_name[estimate.name]), "panel": estimate.panel,
                 "place": index, "kind": estimate.kind,
                 "x": short(min(max(estimate.mean, low), high)), "mean": short(estimate.mean),
                 "low": short(min(max(estimate.low, low), high)), "high": short(min(max(estimate.high, low), high)),
-                "off": ("left" if estimate.mean < low else "right") if off else "",
+                "off": ("left" if estimate.mean < low else "right") if is_outside else "",
                 "interval": "" if math.isnan(estimate.low) else f"{text_of(estimate.low)} to {text_of(estimate.high)}",
                 "level": short((level or {}).get(estimate.panel, math.nan)),
             }
@@ -235,8 +235,8 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
         "scale": {"domain": list(KINDS), "range": list(KINDS.values())},
     }
     scale: ChartScale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
-    across: ChartChannel = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
-    tip = [tip_of("name", ""), tip_of("mean", x), tip_of("interval", "95 % interval"), tip_of("kind", "kind")]
+    x_channel: ChartChannel = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
+    tooltip = [tip_of("name", ""), tip_of("mean", x), tip_of("interval", "95 % interval"), tip_of("kind", "kind")]
     layer: list[Spec] = [
         {"mark": {"type": "rule", "stroke": QUIET, "strokeDash": [3, 3]},
          "encoding": {"x": {"field": "level", "type": "quantitative"}}},
@@ -244,41 +244,52 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
          "encoding": {"y": y, "x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}, "color": colour}},
         {"transform": [{"filter": "datum.off === ''"}],
          "mark": {"type": "circle", "size": 90, "opacity": 1},
-         "encoding": {"y": y, "x": across, "color": colour, "tooltip": tip}},
+         "encoding": {"y": y, "x": x_channel, "color": colour, "tooltip": tooltip}},
         {"transform": [{"filter": "datum.off !== ''"}],
          "mark": {"type": "point", "filled": True, "size": 90, "shape": {"expr": "'triangle-' + datum.off"}, "opacity": 1},
-         "encoding": {"y": y, "x": across, "color": colour, "tooltip": tip}},
+         "encoding": {"y": y, "x": x_channel, "color": colour, "tooltip": tooltip}},
     ]  # fmt: skip
     if len(panels) == 1:
-        return {"data": {"values": values}, "height": {"step": row}, "layer": layer}
+        return {"data": {"values": values}, "height": {"step": row_height}, "layer": layer}
     return {
         "data": {"values": values},
         "facet": {"row": {"field": "panel", "type": "nominal", "sort": panels, "title": None,
                           "header": {"labelAngle": 0, "labelOrient": "top", "labelAnchor": "start", "labelFontWeight": 600,
                                      "labelLimit": 0, "labelPadding": 2}}},
-        "spec": {"height": {"step": row}, "layer": layer},
+        "spec": {"height": {"step": row_height}, "layer": layer},
         "resolve": {"scale": {"y": "independent"}},
         "spacing": 6,
     }  # fmt: skip
 
 
 def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
-    """Return the ends of a ranking's axis, so that outliers do not compress the others."""
+    """Return the lower and upper end of a ranking's axis, chosen so that outliers do not compress the others.
+
+    (0, 1) if there are no means.
+    """
     means = np.array([dot.mean for dot in dots if not math.isnan(dot.mean)])
     if not len(means):
         return 0.0, 1.0
-    middle = float(np.median(means))
-    halves = [(dot.high - dot.low) / 2 for dot in dots if not math.isnan(dot.high - dot.low)]
-    scales = (np.median(np.abs(means - middle)), np.median(halves) if halves else 0.0, 0.02 * abs(middle), 1e-6)
-    far = 6 * float(max(scales))
-    bounds = [end for dot in dots for end in (dot.mean, dot.low, dot.high) if abs(end - middle) <= far]
+    median_mean = float(np.median(means))
+    half_widths = [(dot.high - dot.low) / 2 for dot in dots if not math.isnan(dot.high - dot.low)]
+    scales = (
+        np.median(np.abs(means - median_mean)),
+        np.median(half_widths) if half_widths else 0.0,
+        0.02 * abs(median_mean),
+        1e-6,
+    )
+    max_distance = 6 * float(max(scales))
+    bounds = [end for dot in dots for end in (dot.mean, dot.low, dot.high) if abs(end - median_mean) <= max_distance]
     low, high = min(bounds), max(bounds)
-    room = 0.04 * ((high - low) or abs(high) or 1.0)
-    return low - room, high + room
+    margin = 0.04 * ((high - low) or abs(high) or 1.0)
+    return low - margin, high + margin
 
 
 def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
-    """Return a confusion matrix (name, predicted name) of counts, with mistakes in another colour."""
+    """Return a confusion matrix: a square per pair of true and predicted class that occurs, mistakes in another colour.
+
+    ``counts`` are (true class, predicted class), ``down`` and ``across`` the titles of the axes.
+    """
     totals = np.maximum(counts.sum(axis=1), 1)
     values: list[DataRow] = [
         {
@@ -291,7 +302,7 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         if count
     ]  # fmt: skip
     axis: ChartAxis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
-    places: ChartEncoding = {
+    position_channels: ChartEncoding = {
         "y": {"field": "row", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": down,
               "axis": axis},
         "x": {"field": "column", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": across,
@@ -310,14 +321,20 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         "data": {"values": values},
         "height": {"step": 20},
         "layer": [
-            {"mark": {"type": "rect"}, "encoding": {**places, "color": colour, "opacity": opacity}},
-            {"mark": {"type": "text", "fontSize": 9, "fill": INK}, "encoding": {**places, "text": {"field": "count"}}},
+            {"mark": {"type": "rect"}, "encoding": {**position_channels, "color": colour, "opacity": opacity}},
+            {
+                "mark": {"type": "text", "fontSize": 9, "fill": INK},
+                "encoding": {**position_channels, "text": {"field": "count"}},
+            },
         ],
     }
 
 
 def grid(matrix: AnyFloats, title: str) -> Spec:
-    """Return a square matrix as squares: the colour grows with the distance from 0, blue above and orange below."""
+    """Return a square matrix as squares: the colour is stronger farther from 0, blue above and orange below.
+
+    Squares near 0 are omitted; ``title`` is that of both axes.
+    """
     largest = float(np.abs(matrix).max()) or 1.0
     values: list[DataRow] = [
         {
