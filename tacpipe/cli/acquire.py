@@ -18,11 +18,14 @@ if TYPE_CHECKING:
     from tacpipe.recording.trials import Recorded
 
 SCHEMA_VERSION = 1
-RATE_OFF = 0.1  # Maximum relative deviation from the rig file's rate that is not reported
+RATE_OFF = 0.1  # maximum relative deviation from the rig file's rate that is not reported
 
 
 def add(program: typer.Typer, help_text: str) -> None:
-    """Add the command to ``program``."""
+    """Add the command to ``program``.
+
+    It raises `UsageError` for missing arguments and `DeviceError` if streams were lost.
+    """
 
     @program.command("acquire", help=help_text)
     def acquire(
@@ -122,15 +125,15 @@ def _dry_run(commands: Any, rig: Rig, *, as_json: bool) -> str:
     from tacpipe.recording.recorder import complete_rig
     from tacpipe.recording.watch import describe_figures
 
-    rig = complete_rig(rig)
-    figures = commands.measure(rig)
+    completed = complete_rig(rig)
+    figures = commands.measure(completed)
     if as_json:
         return json.dumps({"schema_version": SCHEMA_VERSION, "streams": {n: asdict(f) for n, f in figures.items()}})
     lines = []
     for name, measured in figures.items():
-        expected_hz = rig.streams[name].sensor.rate_hz
-        off = expected_hz and abs(measured.rate_hz / expected_hz - 1) > RATE_OFF
-        lines.append(describe_figures(name, measured) + (f"; {expected_hz:g} Hz were expected" if off else ""))
+        expected_hz = completed.streams[name].sensor.rate_hz
+        deviates = expected_hz and abs(measured.rate_hz / expected_hz - 1) > RATE_OFF
+        lines.append(describe_figures(name, measured) + (f"; {expected_hz:g} Hz were expected" if deviates else ""))
     return "\n".join(lines)
 
 
@@ -142,6 +145,7 @@ def _report(
     as_json: bool,
     failed: TacpipeError | None = None,
 ) -> None:
+    """Print the dataset's path or, for JSON, one object with the recordings and the error ``failed``, if there is one."""
     from dataclasses import asdict
 
     if as_json:

@@ -69,9 +69,8 @@ def candidates(
     grasp_candidates = find(object_cloud, count, seed, shift, (opening_mm[0] / 1e3, opening_mm[1] / 1e3), camera_m)
     rows = [_row(rank, candidate) for rank, candidate in enumerate(grasp_candidates, 1)]
     if predict is not None:
-        rows = [
-            row | predict(object_cloud, candidate.grasp) for row, candidate in zip(rows, grasp_candidates, strict=True)
-        ]
+        for row, candidate in zip(rows, grasp_candidates, strict=True):
+            row |= predict(object_cloud, candidate.grasp)
     if picture is not None:
         from tacpipe.clouds.candidates import draw
 
@@ -93,7 +92,10 @@ def _on_terminal() -> bool:
 
 
 def _cloud(path: Path, recording: str | None) -> Cloud:
-    """Return the cloud from a file, or from one recording of a dataset."""
+    """Return the cloud from a file, or from one recording of a dataset.
+
+    Raises `UsageError` if the recording is missing, not unique, or has no cloud.
+    """
     from tacpipe.clouds import files
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.engine import pipeline
@@ -143,7 +145,7 @@ def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
 
 
 def _row(rank: int, candidate: Candidate) -> Row:
-    """Return a candidate's values by column; column names end with the unit."""
+    """Return the values of a candidate and its rank by column; column names end with the unit."""
     from tacpipe.clouds.grasp import POINTS, WRIST
 
     grasp = candidate.grasp
@@ -167,6 +169,7 @@ def _units(rows: list[Row]) -> dict[str, str]:
 
 
 def _csv(rows: list[Row]) -> str:
+    """Return rows as CSV with a header."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -198,8 +201,8 @@ def _print_table(rows: list[Row]) -> None:
     from rich.table import Table
 
     columns = ["#", "score", "open mm", "off °", "g1 mm", "g2 mm", "approach"]
-    touched = "pdc_th_counts" in rows[0]
-    columns += ["PDC th", "PDC mf", "mean E th", "mean E mf"] if touched else []
+    has_prediction = "pdc_th_counts" in rows[0]
+    columns += ["PDC th", "PDC mf", "mean E th", "mean E mf"] if has_prediction else []
     table = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1))
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
@@ -207,7 +210,7 @@ def _print_table(rows: list[Row]) -> None:
         cells = [f"{row['rank']}", f"{row['score']:.2f}", f"{row['opening_m'] * 1e3:.0f}", f"{row['off_deg']:.0f}"]
         cells += [" ".join(f"{row[f'{point}_{axis}_m'] * 1e3:.0f}" for axis in "xyz") for point in ("g1", "g2")]
         cells.append(" ".join(f"{row[f'wrist_x_{axis}']:.2f}" for axis in "xyz"))
-        if touched:
+        if has_prediction:
             cells += [f"{row[f'pdc_{finger}_counts']:.0f}" for finger in ("th", "mf")]
             cells += [f"{sum(_electrodes(row, finger)) / 24:.0f}" for finger in ("th", "mf")]
         table.add_row(*cells)

@@ -38,7 +38,9 @@ SUMMARIES = {
 }
 
 
-def _label(program: typer.Typer) -> None:
+def _add_label(program: typer.Typer) -> None:
+    """Add the command ``label``, which sets labels or intervals from options or from a table."""
+
     @program.command(
         "label",
         help=SUMMARIES["label"]
@@ -100,7 +102,9 @@ def _label(program: typer.Typer) -> None:
         terminal.result_json(value) if as_json else terminal.result(changed.directory)
 
 
-def _show(program: typer.Typer) -> None:
+def _add_show(program: typer.Typer) -> None:
+    """Add the command ``show``, which prints an overview of a dataset or a recording, or draws a recording."""
+
     @program.command(
         "show",
         help=SUMMARIES["show"]
@@ -133,7 +137,9 @@ def _show(program: typer.Typer) -> None:
         _print(overview.of(dataset, most=limit), overview.to_text, as_json=as_json, full=full)
 
 
-def _compare(program: typer.Typer) -> None:
+def _add_compare(program: typer.Typer) -> None:
+    """Add the command ``compare``, which prints results next to each other as tables, CSV or JSON."""
+
     @program.command(
         "compare",
         help=SUMMARIES["compare"]
@@ -164,7 +170,9 @@ def _compare(program: typer.Typer) -> None:
                     terminal.show(table, on_stdout=True)
 
 
-def _track(program: typer.Typer) -> None:
+def _add_track(program: typer.Typer) -> None:
+    """Add the command ``track``, which sends stored models and results to experiment trackers."""
+
     @program.command(
         "track",
         help=SUMMARIES["track"]
@@ -181,7 +189,9 @@ def _track(program: typer.Typer) -> None:
             terminal.result(name)
 
 
-def _explain(program: typer.Typer) -> None:
+def _add_explain(program: typer.Typer) -> None:
+    """Add the command ``explain``, which prints how a dataset was made."""
+
     @program.command("explain", help=SUMMARIES["explain"] + "\n\nExample: tacpipe explain results/forward")
     def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
         from tacpipe.datasets import lineage
@@ -189,7 +199,9 @@ def _explain(program: typer.Typer) -> None:
         _print(lineage.trace(dataset), lineage.to_text, as_json=as_json)
 
 
-def _demo(program: typer.Typer) -> None:
+def _add_demo(program: typer.Typer) -> None:
+    """Add the command ``demo``, which runs a chain of commands on simulated recordings or an emulated rig."""
+
     @program.command("demo", help=SUMMARIES["demo"] + "\n\nExample: tacpipe demo -o demo")
     def demo(
         output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")] = Path("demo"),
@@ -202,7 +214,9 @@ def _demo(program: typer.Typer) -> None:
         terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
 
 
-def _version(program: typer.Typer) -> None:
+def _add_version(program: typer.Typer) -> None:
+    """Add the command ``version``, which prints the versions of the parts."""
+
     @program.command("version", help=SUMMARIES["version"] + "\n\nExample: tacpipe version --json")
     def version(as_json: AsJson = False) -> None:
         from tacpipe.cli import versions
@@ -241,19 +255,19 @@ def _ends_with_its_reader() -> Iterator[None]:
 NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _from_module("acquire"),
     "live": _from_module("live"),
-    "label": _label,
-    "show": _show,
-    "compare": _compare,
-    "track": _track,
+    "label": _add_label,
+    "show": _add_show,
+    "compare": _add_compare,
+    "track": _add_track,
     "view": _from_module("view"),
     "run": _from_module("run"),
-    "explain": _explain,
+    "explain": _add_explain,
     "sensors": _from_module("sensors"),
     "store": _from_module("store"),
     "candidates": _from_module("candidates"),
     "limits": _from_module("limits"),
-    "demo": _demo,
-    "version": _version,
+    "demo": _add_demo,
+    "version": _add_version,
 }
 
 
@@ -266,7 +280,7 @@ SHOWN = 20  # Maximum number of recordings whose changes are printed
 
 
 def refuse_others(*others: object, option: str = "--from") -> None:
-    """Raise `UsageError` if labels are passed both as a table and on the command line."""
+    """Raise `UsageError` if one of ``others``, options that exclude ``option``, has a value."""
     if any(other is not None and other is not False and other != [] for other in others):
         raise UsageError(
             f"{option} names recordings and labels itself. Leave out names, --label, --interval, --exclude and --include."
@@ -274,7 +288,10 @@ def refuse_others(*others: object, option: str = "--from") -> None:
 
 
 def label_intervals(dataset: Path, path: Path, *, as_json: bool) -> None:
-    """Replace the labelled intervals of the recordings in a CSV."""
+    """Replace the labelled intervals of the recordings in a CSV, and print the dataset's path or JSON.
+
+    Raises `TacpipeError` if the file cannot be read or names a recording that does not exist.
+    """
     from tacpipe.datasets import labels
     from tacpipe.formats.table.label_table import read_intervals
 
@@ -297,19 +314,23 @@ def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
 
 
 def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) -> None:
-    """Set the labels in a table on a dataset's recordings, or print the changes if ``dry_run`` is true."""
+    """Set the labels in a table on a dataset's recordings, or only print the changes if ``dry_run`` is true.
+
+    Recordings without a row are reported. ``key`` is the column with the names of recordings, "" to detect it. Raises
+    `TacpipeError` if the file cannot be read or does not match.
+    """
     from tacpipe.datasets import labels
     from tacpipe.formats.table.label_table import LabelTable, read_label_table
 
-    table: list[LabelTable] = []
+    tables_read: list[LabelTable] = []
 
     def labels_for(current_labels: labels.ByRecording) -> labels.ByRecording:
-        table.append(read_label_table(path, key, current_labels))
-        return table[-1].by_recording(current_labels)
+        tables_read.append(read_label_table(path, key, current_labels))
+        return tables_read[-1].by_recording(current_labels)
 
     current, changes = labels.planned(dataset, labels_for)
-    unmatched = sorted(set(current) - set(table[-1].by_recording(current)))
-    value = {"schema_version": 1, "output": str(dataset), "key": table[-1].key, "without": unmatched}
+    unmatched = sorted(set(current) - set(tables_read[-1].by_recording(current)))
+    value = {"schema_version": 1, "output": str(dataset), "key": tables_read[-1].key, "without": unmatched}
     if dry_run:
         if as_json:
             terminal.result_json({**value, "recordings": sorted(changes), "labels": changes})
@@ -332,15 +353,12 @@ def _describe_changes(
     count: int,
     unmatched: Sequence[str],
 ) -> str:
-    """Return one line per recording whose labels would change, and a line with the number of recordings."""
-    lines = [
-        f"{plain(name)}: "
-        + ", ".join(
-            f"{plain(key)} {_format_value(current[name].get(key))} → {_format_value(value)}"
-            for key, value in labels.items()
-        )
-        for name, labels in sorted(changes.items())[:SHOWN]
-    ]
+    """Return one line per recording whose labels would change, those without a row, and the number of recordings."""
+    lines = []
+    for name, labels in sorted(changes.items())[:SHOWN]:
+        old = current[name]
+        texts = (f"{plain(k)} {_format_value(old.get(k))} → {_format_value(value)}" for k, value in labels.items())
+        lines.append(f"{plain(name)}: {', '.join(texts)}")
     lines += [f"… and {len(changes) - SHOWN} more"] if len(changes) > SHOWN else []
     lines += [f"no row for {listed(unmatched)}"] if unmatched else []
     return "\n".join([*lines, f"{len(changes)} of {count} recordings would change"])

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 METRICS = "metrics.json"
-_LISTED = 3  # Maximum number of values listed in a cell
-_DIGITS = 9  # Significant digits, as in stored headlines
+_LISTED = 3  # maximum number of values listed in a cell
+_DIGITS = 9  # significant digits, as in stored headlines
 
 
 class RowJson(TypedDict):
@@ -76,7 +76,7 @@ class Compared:
     results: Mapping[str, Dataset]
     comparisons: Sequence[Comparison]
     pooled: bool
-    places: Mapping[str, str] = field(default_factory=dict)  # Dataset paths by manifest digest
+    places: Mapping[str, str] = field(default_factory=dict)  # dataset paths by manifest digest
 
     def paths(self, row: engine.ComparisonRow) -> list[str]:
         """Return the paths of a row's results."""
@@ -108,6 +108,7 @@ class Compared:
         return {"schema_version": 1, "comparisons": [self._json(comparison) for comparison in self.comparisons]}
 
     def _json(self, comparison: Comparison) -> ComparisonJson:
+        """Return the JSON value of one comparison, with all its rows."""
         return {
             "task": comparison.task,
             "part": comparison.question.part,
@@ -121,6 +122,7 @@ class Compared:
         }
 
     def _row(self, comparison: Comparison, row: engine.ComparisonRow) -> RowJson:
+        """Return the JSON value of a method or baseline; ``results`` are the paths of a method's results."""
         model = row.kind in ("model", "variant", "control") and row.predictor.startswith("model")
         return {
             "name": row.name,
@@ -141,24 +143,18 @@ class Compared:
 
     def to_csv(self) -> str:
         """Return a CSV with one line per predictor and question, and a column for each setting and error."""
-        flat = [
-            {
-                "task": comparison["task"],
-                "part": comparison["part"],
-                "target": comparison["target"],
-                "measure": comparison["measure"],
-                **{name: value for name, value in row.items() if name not in ("settings", "errors", "results")},
-                **row["settings"],
-                **row["errors"],
-                "results": " ".join(row["results"]),
-            }
-            for comparison in self.to_json()["comparisons"]
-            for row in comparison["rows"]
-        ]
+        lines = []
+        for comparison in self.to_json()["comparisons"]:
+            question = {name: comparison[name] for name in ("task", "part", "target", "measure")}
+            for row in comparison["rows"]:
+                values = {name: value for name, value in row.items() if name not in ("settings", "errors", "results")}
+                lines.append(
+                    {**question, **values, **row["settings"], **row["errors"], "results": " ".join(row["results"])}
+                )
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(dict.fromkeys(name for row in flat for name in row)), lineterminator="\n")
+        writer = csv.DictWriter(text, list(dict.fromkeys(name for line in lines for name in line)), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(flat)
+        writer.writerows(lines)
         return text.getvalue().rstrip("\n")
 
     def tables(self) -> list[TerminalTable]:
@@ -172,9 +168,13 @@ class Compared:
         return [self._table(comparisons) for comparisons in by_columns.values()]
 
     def _table(self, comparisons: Sequence[Comparison]) -> TerminalTable:
+        """Return the table of comparisons with the same columns: methods, then the best baseline and the reference baseline.
+
+        Columns are added for differing settings, and for baselines and runs where they vary.
+        """
         measure = comparisons[0].measure
-        competing = [[row for row in comparison.rows if _competes(row)] for comparison in comparisons]
-        all_rows = [row for rows in competing for row in rows]
+        rows_by_comparison = [[row for row in comparison.rows if _competes(row)] for comparison in comparisons]
+        all_rows = [row for rows in rows_by_comparison for row in rows]
         differing, names = self.differing(all_rows), [_first_name(row) for row in all_rows]
         if len(set(names)) == 1 and "result" in differing:  # All rows have the same method, so paths distinguish them
             names = differing.pop("result")
@@ -184,7 +184,7 @@ class Compared:
         heads = ["", *differing, *measure.columns, measure.name, "95 % interval"]
         heads += [*(["vs"] if names_baselines else []), "n", *(["runs"] if pooled else [])]
         groups, index = [], 0
-        for comparison, rows in zip(comparisons, competing, strict=True):
+        for comparison, rows in zip(comparisons, rows_by_comparison, strict=True):
             lines = []
             for row in rows:
                 cells = [names[index], *(cells[index] for cells in differing.values())]
@@ -209,13 +209,18 @@ class Compared:
             groups.append(
                 RowGroup(comparison.question.where if len(comparisons) > 1 or comparison.question.where else "", lines)
             )
-        first = 1 + len(differing)
-        errors = list(range(first, first + len(measure.columns)))
-        spare = [*errors[1:-2], *errors[-2:-1], *errors[:1]] if len(errors) > 2 else errors[:1] * (len(errors) > 1)
-        texts = [0, *range(1, first), *([heads.index("vs")] if names_baselines else [])]
-        return TerminalTable(heads, groups, self._caption(comparisons), spare=list(dict.fromkeys(spare)), left=texts)
+        first_error = 1 + len(differing)
+        errors = list(range(first_error, first_error + len(measure.columns)))
+        spare_columns = (
+            [*errors[1:-2], *errors[-2:-1], *errors[:1]] if len(errors) > 2 else errors[:1] * (len(errors) > 1)
+        )
+        text_columns = [0, *range(1, first_error), *([heads.index("vs")] if names_baselines else [])]
+        return TerminalTable(
+            heads, groups, self._caption(comparisons), spare=list(dict.fromkeys(spare_columns)), left=text_columns
+        )
 
     def _caption(self, comparisons: Sequence[Comparison]) -> str:
+        """Return the caption of a table: units, what n counts, and the meaning of the measure and its intervals."""
         measure = comparisons[0].measure
         clusters = ", ".join(dict.fromkeys(comparison.measure.cluster for comparison in comparisons))
         skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
@@ -237,9 +242,10 @@ class Compared:
 
 
 def run(paths: Sequence[Path], *, pool: bool) -> Compared:
-    """Compare results and warn about those that contain nothing to compare.
+    """Return the comparison of results, and warn about those that contain nothing to compare.
 
-    Raises `UsageError` for a dataset that is not a result, and if no result contains anything to compare.
+    ``pool`` joins runs that differ only in seed or fold. Raises `UsageError` for a dataset that is not a result, and if
+    no result contains anything to compare.
     """
     results = {str(path): pipeline.open_dataset(path) for path in paths}
     for path, result in results.items():
@@ -268,6 +274,7 @@ def _first_name(row: engine.ComparisonRow) -> str:
 
 
 def _gain(row: engine.ComparisonRow, measure: str) -> list[str]:
+    """Return the gain over the best baseline and its interval as texts, "–" for those that are missing."""
     if not row.baseline:
         return [headline.NONE, headline.NONE]
     low, high = (headline.format_gain(value, measure) for value in (row.gain.low, row.gain.high))

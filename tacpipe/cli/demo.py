@@ -36,17 +36,17 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     try:
         if not serving.stdout.readline():  # The command prints the path of its rig file once all streams are served.
             raise TacpipeError(f"The demo stopped: {rig_file} could not be emulated.")
-        acquire, *chain = demo_rig(output)
+        acquire, *later_commands = demo_rig(output)
         _run([acquire])
     finally:
         serving.terminate()
         serving.communicate()
-    _run(chain)
+    _run(later_commands)
     return demo_page(output)
 
 
 def _run(commands: list[list[str]]) -> None:
-    """Run commands in sequence and print one line for each, and the errors if one fails."""
+    """Run commands in sequence and print each; the commands print their errors. Raises `TacpipeError` if one fails."""
     for command in commands:
         terminal.note("$ tacpipe " + " ".join(command))
         quiet = [] if command[0] == "show" else ["--quiet"]
@@ -63,7 +63,7 @@ def _run(commands: list[list[str]]) -> None:
 
 
 def headline_of(result: Path) -> str:
-    """Return a sentence that compares the model of a result with its best baseline."""
+    """Return a sentence that compares the model of a result with its best baseline, or that there is none."""
     from tacpipe.cli import headline_table
     from tacpipe.metrics import headline
 
@@ -98,7 +98,7 @@ def demo_commands(output: Path) -> list[list[str]]:
 
 
 def demo_rig(output: Path) -> list[list[str]]:
-    """Return the commands that record the running emulated rig for 30 s and process the recordings up to a forecast."""
+    """Return the commands that record the running emulated rig for 30 s, process the recordings and evaluate a forecast."""
     recordings = str(output / "recordings")
     live = ["--trials", str(LIVE_TRIALS), "--duration-s", str(LIVE_S / LIVE_TRIALS)]
     return [

@@ -35,17 +35,15 @@ def method(task: object, stored: ParamValue) -> str:
 
 
 def table(headlines: Sequence[Headline]) -> TerminalTable:
-    """Return a table of headlines: for each part, the model and below it its best baseline."""
+    """Return a table of headlines: for each part, the model, below it its best baseline, and other baselines."""
     first = headlines[0]
     heads = ["", *first.columns, first.measure, "95 % interval", "n"]
     groups = []
     for entry in headlines:
         styles = {headline.BETTER: "green", headline.WORSE: "red"}
-        gain = [
-            headline.format_gain(entry.gain, entry.measure) if entry.best else headline.NONE,
-            headline.bounds(entry),
-        ]
-        cells = [entry.method, *map(headline.number, entry.model.values), gain[0], gain[1] or headline.NONE]
+        gain = headline.format_gain(entry.gain, entry.measure) if entry.best else headline.NONE
+        interval = headline.bounds(entry) or headline.NONE
+        cells = [entry.method, *map(headline.number, entry.model.values), gain, interval]
         rows = [TerminalRow([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
         if entry.best:
             values = map(headline.number, entry.best.values)
@@ -84,7 +82,7 @@ def text(headlines: Sequence[Headline], width: int = terminal.WIDTH) -> str:
 
 
 def show(headlines: Sequence[Headline]) -> None:
-    """Print headlines to stderr."""
+    """Print headlines to stderr, or that there are none."""
     if headlines:
         terminal.show(table(headlines), on_stdout=False)
     else:

@@ -15,13 +15,13 @@ from typer.core import TyperCommand, TyperGroup
 from tacpipe.io.files import local
 
 REQUIRED, PARAMS, RUN, OUTPUT, OPTIONS = "Required", "Params", "Run", "Output", "Options"
-PANELS = {  # Panels of options that several commands have. The params of a stage specify their own.
+PANELS = {  # panels of options that several commands have; the params of a stage specify their own
     **dict.fromkeys(("preset", "params_file", "block", "set_", "print_params"), PARAMS),
     **dict.fromkeys(("split", "fold", "role", "codec", "init", "extend"), "Data"),
     **dict.fromkeys(("jobs", "executor", "skip_bad", "check", "compare", "rerun", "replace", "dry_run"), RUN),
     **dict.fromkeys(("output", "json_", "as_json", "quiet", "help"), OUTPUT),
 }
-LAST = (PARAMS, RUN, OUTPUT)  # Panels shown after all others.
+LAST = (PARAMS, RUN, OUTPUT)  # panels shown after all others
 COMMON = (
     "architecture",
     "epochs",
@@ -36,10 +36,10 @@ COMMON = (
     "json_",
     "help",
 )
-# Former names of options, which still work but are not shown in help.
+# former names of options, which still work but are not shown in help
 OLD_NAMES = {"--duration": "--duration-s", "--set": "--label", "--store": "--remote"}
-EXAMPLE = "Example: "  # Start of a paragraph with a command line, which is printed without line breaks.
-BRIEF_LINES = 40  # Maximum number of lines that ``-h`` prints.
+EXAMPLE = "Example: "  # start of a paragraph with a command line, which is printed without line breaks
+BRIEF_LINES = 40  # maximum number of lines that ``-h`` prints
 TYPES = {
     "integer": "INTEGER",
     "int": "INTEGER",
@@ -47,7 +47,7 @@ TYPES = {
     "path": "PATH",
     "file": "PATH",
 }
-SECTIONS = {  # Commands in the order of ``tacpipe --help``. Stages from other packages come last.
+SECTIONS = {  # commands in the order of ``tacpipe --help``; stages from other packages come last
     "Record": ("acquire", "live", "sensors"),
     "Import and export": ("ingest", "simulate", "export"),
     "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
@@ -64,7 +64,10 @@ class PanelCommand(TyperCommand):
     brief = False  # whether to show only common options
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse a command line. Accepts an option name in `OLD_NAMES` if the command has no option of that name."""
+        """Parse a command line as click does, and return the remaining arguments.
+
+        An option name in `OLD_NAMES` is accepted if the command has no option of that name.
+        """
         options = {name for param in self.params for name in (*param.opts, *param.secondary_opts)}
         renamed = {old: new for old, new in OLD_NAMES.items() if new in options and old not in options}
         end = args.index("--") if "--" in args else len(args)
@@ -123,9 +126,9 @@ class PanelCommand(TyperCommand):
         common = [number for name in COMMON for number, param in enumerate(optional) if param.name == name]
         shown_numbers: set[int] = set()
         for number in dict.fromkeys([*common, *range(len(optional))]):
-            draft = type(formatter)(width=formatter.width, max_width=formatter.width)
-            draft.write_dl([rows[index] for index in sorted({*shown_numbers, number})] if rows else [])
-            if (formatter.getvalue() + draft.getvalue()).count("\n") > BRIEF_LINES - 4:
+            trial = type(formatter)(width=formatter.width, max_width=formatter.width)
+            trial.write_dl([rows[index] for index in sorted({*shown_numbers, number})] if rows else [])
+            if (formatter.getvalue() + trial.getvalue()).count("\n") > BRIEF_LINES - 4:
                 break
             shown_numbers.add(number)
         with formatter.section(OPTIONS):
@@ -144,7 +147,7 @@ class HelpGroup(TyperGroup):
     """Group of commands whose help shows each command's complete summary."""
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
-        """Write the description."""
+        """Write the description, one paragraph after another."""
         formatter.write_paragraph()
         with formatter.indentation():
             for number, text in enumerate(plain(inspect.cleandoc(self.help or "")).split("\n\n")):
@@ -196,7 +199,7 @@ def _argument_name(param: Any) -> str:
 
 
 def _metavar(param: Any, ctx: Any) -> str:
-    """Return the placeholder of an option's value, which is its choices or its type."""
+    """Return the placeholder of an option's value: its own, its choices, or its type."""
     if param.metavar:
         return str(param.metavar)
     placeholder = param.get_help_record(ctx)[0].split(" ", maxsplit=2 if len(param.opts) > 1 else 1)[-1]
@@ -241,7 +244,7 @@ def _sentence(text: str) -> str:
 
 
 def _brief_record(param: Any, ctx: Any) -> tuple[str, str]:
-    """Return a parameter's record with only the first clause of its help."""
+    """Return the syntax and help of a parameter as `_record` does, with only the first clause of the help."""
     names, text = _record(param, ctx)
     default = re.search(r" \[default: [^\]]+\]$", text)
     clause = re.split(r"; |: |\. |\.$", text[: default.start()] if default else text)[0]
@@ -268,10 +271,15 @@ def refuse_addresses(program: typer.Typer) -> None:
             refuse_addresses(group.typer_instance)
     for command in program.registered_commands:
         if command.callback is not None:
-            command.callback = _checked(command.callback)
+            command.callback = _refusing_addresses(command.callback)
 
 
-def _checked(callback: Callable[..., Any]) -> Callable[..., Any]:
+def _refusing_addresses(callback: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the callback of a command such that it refuses URLs as paths.
+
+    Raises `UsageError` when it is called with one.
+    """
+
     @functools.wraps(callback)
     def call(*args: Any, **options: Any) -> Any:
         for value in options.values():

@@ -25,7 +25,7 @@ ABOUT = (
     "the model also reads the other finger. Skill is 1 - RMSE / RMSE of the constant. The command takes minutes."
 )
 EXAMPLE = "\n\nExample: tacpipe limits data/grasps -o results/limits.json"
-HEADER = '{"schema_version": 1, "limits"'  # Start of the file
+HEADER = '{"schema_version": 1, "limits"'  # start of the file
 TARGETS = ("pdc_th", "pdc_mf", "e_th", "e_mf")
 
 
@@ -46,7 +46,7 @@ def limits(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print what limits the prediction of touch on grasps."""
-    training_sizes = _sizes(sizes)
+    training_sizes = _parse_sizes(sizes)
     if output is not None:
         replacing.refuse_foreign(output, HEADER.encode())
     from tacpipe.engine import pipeline
@@ -72,14 +72,11 @@ def format_limits(measured: Limits) -> str:
         ("skill of a predictor whose error equals their difference", "pair_skill"),
         ("similarity of the readings of one object", "likeness"),
     ):
-        rows = [
-            [
-                _bounds(low, high),
-                str(max(estimates.pairs for estimates in by_target.values())),
-                *(_cell(getattr(by_target[name], measure)) for name in TARGETS),
-            ]
-            for low, high, by_target in measured.near
-        ]
+        rows = []
+        for low, high, by_target in measured.near:
+            pairs = max(estimates.pairs for estimates in by_target.values())
+            cells = [_cell(getattr(by_target[name], measure)) for name in TARGETS]
+            rows.append([_bounds(low, high), str(pairs), *cells])
         lines += ["", f"pairs of grasps: {title}", *_table(["distance (mm)", "pairs", *TARGETS], rows)]
     lines += ["", "learning curve: skill on known objects"]
     rows = [
@@ -104,7 +101,8 @@ def _write(path: Path, content: str) -> None:
         write_whole(str(path), content.encode(), f"{path}.draft")
 
 
-def _sizes(option_text: str) -> list[int]:
+def _parse_sizes(option_text: str) -> list[int]:
+    """Return the sizes of a comma-separated list, sorted. Raises `UsageError` unless they are whole numbers from 1."""
     try:
         sizes = [int(size) for size in option_text.split(",")]
     except ValueError:
@@ -130,6 +128,7 @@ def _format_fixed(value: float) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    """Return the lines of a table of text with aligned columns."""
     widths = [max(len(str(row[column])) for row in [heads, *rows]) for column in range(len(heads))]
     return [
         "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

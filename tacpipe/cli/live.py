@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.recording.recorder import Recorder
 
 SCHEMA_VERSION = 1
-REPEATED = ("publish",)  # Settings whose option may be repeated, once per item
+REPEATED = ("publish",)  # settings whose option may be repeated, once per item
 HELP = """
 
 The table [live] of the rig file can contain the settings. Options of the command override it.
@@ -43,7 +43,10 @@ Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alar
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the command to ``program``, with an option for each setting of every task whose models can run live."""
+    """Add the command to ``program``, with an option for each setting of every task whose models can run live.
+
+    It raises `UsageError` for a duration that is not above 0.
+    """
 
     def live(
         rig: Annotated[Path, typer.Argument(help="Rig file, as for `tacpipe acquire`.")],
@@ -72,9 +75,10 @@ def add(program: typer.Typer, summary: str) -> None:
         _run(session, output, name, duration, label or [], pictures, quiet=quiet, as_json=as_json)
 
     signature = inspect.signature(live, eval_str=True)
-    kinds = inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.VAR_KEYWORD
     fixed = [
-        parameter.replace(kind=kinds[0]) for parameter in signature.parameters.values() if parameter.kind != kinds[1]
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in signature.parameters.values()
+        if parameter.kind != inspect.Parameter.VAR_KEYWORD
     ]
     complete = signature.replace(parameters=[*fixed, *_options()])
     function: Any = live
@@ -96,6 +100,7 @@ def _options() -> list[inspect.Parameter]:
 
 
 def _options_for(kind: type[Any], panel: str | None) -> dict[str, inspect.Parameter]:
+    """Return an option for each setting of a class, by name, in a panel of the help; help texts only if help is printed."""
     from tacpipe.live import settings
     from tacpipe.plugins import fields, params
 
@@ -106,7 +111,11 @@ def _options_for(kind: type[Any], panel: str | None) -> dict[str, inspect.Parame
         flag = settings.option(name)
         is_flag = fields.bare(annotation) is bool
         flags = [f"{flag}/--no-{flag.removeprefix('--')}"] if is_flag else [flag]
-        parsed: Any = bool | None if is_flag else list[str] | None if name in REPEATED else str | None
+        option_type: Any = str | None
+        if is_flag:
+            option_type = bool | None
+        elif name in REPEATED:
+            option_type = list[str] | None
         about = helps.get(name, "")
         option = typer.Option(
             None,
@@ -116,7 +125,7 @@ def _options_for(kind: type[Any], panel: str | None) -> dict[str, inspect.Parame
             metavar="NUMBER" if fields.bare(annotation) in (int, float) else None,
             rich_help_panel=panel,
         )
-        options[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=parsed)
+        options[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=option_type)
     return options
 
 
@@ -131,7 +140,10 @@ def _run(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Run a session and print its summary."""
+    """Run a session, with a recording if there is an ``output``, and print its summary.
+
+    Raises the errors of the rig and the model, and ends the program with an error if streams were lost.
+    """
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
@@ -164,7 +176,7 @@ def _run(
             levels = json.dumps(supervisor.alarms, separators=(",", ":"))
             plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
-            _follow(recorder, duration_s, view, is_over)
+            _run_unrecorded(recorder, duration_s, view, is_over)
             lost = recorder.lost()
         else:
             recorded, lost = trials.run(recorder, store, plan, view, is_over)
@@ -183,8 +195,8 @@ def _lines(supervisor: Supervisor) -> list[str]:
     return session.describe_figures(supervisor.figures())
 
 
-def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:
-    """Run the rig without recording."""
+def _run_unrecorded(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:
+    """Run the rig without recording until it ``is_over`` or ``duration_s`` have passed; None for no limit."""
     from tacpipe.recording import clock
 
     began_s = clock.now_s()
@@ -199,6 +211,10 @@ def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: En
 def _report(
     output: Path | None, recorded: list[Any], figures: Any, supervisor: Supervisor, lost: list[str], *, as_json: bool
 ) -> None:
+    """Print the dataset's path, or one JSON object.
+
+    Raises `DeviceError`, or exits with its code for JSON, if streams were lost.
+    """
     from dataclasses import asdict
 
     failed = DeviceError("\n".join(["What came is kept, but streams were lost on the way.", *lost])) if lost else None

@@ -23,7 +23,7 @@ from tacpipe.plugins import extras
 if TYPE_CHECKING:
     import typer
 
-COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # Set by the shell: complete_bash, complete_zsh, complete_fish or source_...
+COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # set by the shell: complete_bash, complete_zsh, complete_fish or source_...
 
 
 def words_to_complete(environment: Mapping[str, str] = os.environ) -> list[str] | None:
@@ -57,12 +57,15 @@ Exit codes: 0 done, 1 to 6 and 130 as in docs/reference/exit-codes.md.
 """
 
 
-MAX_WIDTH = 1_000  # Maximum width of help in columns; a narrower terminal's width is used.
-ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # Aliases that are not listed in help and completion
+MAX_WIDTH = 1_000  # maximum width of help in columns; a narrower terminal's width is used
+ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # aliases that are not listed in help and completion
 
 
 def app(arguments: Sequence[str]) -> typer.Typer:
-    """Return the program for ``arguments``, with only the command that they name, or with all commands for help."""
+    """Return the program for ``arguments``, with only the command that they name, or with all commands for help.
+
+    ``--version`` prints the versions and exits.
+    """
     import typer
 
     from tacpipe.cli import commands
@@ -120,7 +123,7 @@ def main() -> None:
 
 
 def _flush_output(code: int) -> int:
-    """Flush the output of a command and return its exit code, or `FAILED` if the output could not be written."""
+    """Flush the output of a command and return its exit code ``code``, or `FAILED` if the output could not be written."""
     failure = terminal.unprinted()
     if failure is None or code != DONE:
         return code
@@ -169,18 +172,18 @@ def _complain(sentence: str) -> None:
 
 
 def _call(arguments: Sequence[str]) -> tuple[int, str]:
-    """Run a command line and return its exit code, and a message if the command line is malformed."""
+    """Run a command line and return its exit code, and a message if it is malformed, else ""."""
     import typer
 
     from tacpipe.cli import help as plain_help
 
-    arguments = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
-    program = app(arguments if (completed_words := words_to_complete()) is None else completed_words)
+    words = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
+    program = app(words if (completed_words := words_to_complete()) is None else completed_words)
     help.refuse_addresses(program)
-    plain_help.apply(program, brief="-h" in arguments)
+    plain_help.apply(program, brief="-h" in words)
     try:
         with extras.explain_missing("This command"):
-            code = typer.main.get_command(program).main(arguments, prog_name="tacpipe", standalone_mode=False)
+            code = typer.main.get_command(program).main(words, prog_name="tacpipe", standalone_mode=False)
     except typer.Abort:
         return FAILED, ""
     except _misuse() as error:

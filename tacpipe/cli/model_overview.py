@@ -23,15 +23,15 @@ from tacpipe.training.following import Line
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
-FILES = 5  # Maximum number of files of a result that are listed; further files are counted
-SHOWN = 8  # Maximum length of a displayed list or nested mapping; longer ones are counted
+FILES = 5  # maximum number of files of a result that are listed; further files are counted
+SHOWN = 8  # maximum length of a displayed list or nested mapping; longer ones are counted
 _APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
 _ROLES = ("train", "val", "test")
 
 
 def is_model(opened: Dataset) -> bool:
     """Return whether a dataset is a model, i.e. has a configuration with a task, and no metrics."""
-    return CONFIG in opened.files and METRICS not in opened.files and "task" in _tree(opened, CONFIG)
+    return CONFIG in opened.files and METRICS not in opened.files and "task" in _read_tree(opened, CONFIG)
 
 
 def is_result(opened: Dataset) -> bool:
@@ -96,11 +96,14 @@ class ResultOverview(ModelOrigin):
 
 
 def of_model(opened: Dataset, store: Store) -> ModelOverview:
-    """Return the overview of a model: task, architecture, training data, params and validation."""
-    config, history = _tree(opened, CONFIG), _history(opened)
+    """Return the overview of a model: task, architecture, training data, params and validation.
+
+    Raises the errors of `_read_tree`.
+    """
+    config, history = _read_tree(opened, CONFIG), _history(opened)
     return {
         **_describe_config(config),
-        "parameters": config.get("parameters") or _parameters(opened),
+        "parameters": config.get("parameters") or _count_parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
         "params": params_of.with_current_names(opened.source.stage, config.get("params", opened.source.params)),
@@ -110,8 +113,11 @@ def of_model(opened: Dataset, store: Store) -> ModelOverview:
 
 
 def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
-    """Return the overview of a result: the model and its baselines, the evaluated data and their role."""
-    config, metrics = _tree(opened, CONFIG), _tree(opened, METRICS)
+    """Return the overview of a result: the model and its baselines, the evaluated data and their role.
+
+    ``found`` is where it was found in ``store``. Raises the errors of `_read_tree`.
+    """
+    config, metrics = _read_tree(opened, CONFIG), _read_tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
     identity = identities_of_manifests(store).get(found.digest)
     return {
@@ -136,7 +142,7 @@ def model_text(value: ModelOverview) -> list[str]:
         ("task", value["task"]),
         ("architecture", value["architecture"]),
         ("parameters", f"{value['parameters']:,}" if value["parameters"] else None),
-        *(("trained on" if not at else "", text) for at, text in enumerate(_describe_training(value["trained_on"]))),
+        *_named_once("trained on", _describe_training(value["trained_on"])),
         ("epochs", value["epochs"]),
         ("validation", flat(value["validation"]) if value["validation"] else None),
         *value["about"].items(),
@@ -174,7 +180,7 @@ def result_text(value: ResultOverview) -> list[str]:
         ("role", f"{value['role']}{fold}" if value["role"] else None),
         ("baselines", ", ".join(value["baselines"]) or None),
         ("params", flat(value["params"]) if value["params"] else None),
-        *(("trained on" if not at else "", text) for at, text in enumerate(_describe_training(value["trained_on"]))),
+        *_named_once("trained on", _describe_training(value["trained_on"])),
         *_input_rows(value["inputs"]),
     ]
     return [*lines, "", *_align_columns(described)]
@@ -190,6 +196,7 @@ def flat(value: Any) -> str:
 
 
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each value in nested values; long lists are replaced by their length."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from _leaves(item, f"{name} {key}".strip().replace("_", " "))
@@ -245,6 +252,7 @@ def _short_text(value: Any) -> str | None:
 
 
 def _describe_training(trained: TrainingCounts) -> list[str]:
+    """Return a line per role with its numbers of training data, and one with the number of recordings."""
     lines = [
         f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
         for role, counts in trained["roles"].items()
@@ -254,25 +262,26 @@ def _describe_training(trained: TrainingCounts) -> list[str]:
 
 
 def _input_rows(inputs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
-    return [
-        (name if not at else "", described)
-        for name, descriptions in inputs.items()
-        for at, described in enumerate(descriptions)
-    ]
+    """Return rows of name and text for the inputs of a dataset; only the first of an argument has its name."""
+    return [row for name, descriptions in inputs.items() for row in _named_once(name, descriptions)]
+
+
+def _named_once(name: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Return rows of name and text, of which only the first has the name."""
+    return [(name if not index else "", text) for index, text in enumerate(texts)]
 
 
 def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:
-    """Return each input's digest, and its path if it is in the store."""
-    places = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
+    """Return each input's path and digest; a path only if it is in the store."""
+    paths = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
     return {
-        name: [
-            f"{places.get(entry['manifest'], 'in no known location')} [{entry['dataset'][:12]}]" for entry in entries
-        ]
+        name: [f"{paths.get(entry['manifest'], 'in no known location')} [{entry['dataset'][:12]}]" for entry in entries]
         for name, entries in inputs.items()
     }
 
 
-def _tree(opened: Dataset, name: str) -> Values:
+def _read_tree(opened: Dataset, name: str) -> Values:
+    """Return the mapping in a JSON file, or an empty one if it is missing. Raises `TacpipeError` if it is not JSON."""
     if name not in opened.files:
         return {}
     try:
@@ -294,8 +303,8 @@ def _best(history: list[Line]) -> BestEpoch | None:
     return {"epoch": best["epoch"], "loss": best["val_loss"]} if best else None
 
 
-def _parameters(opened: Dataset) -> int | None:
-    """Return the number of weights, from the headers of the model's own safetensors files."""
+def _count_parameters(opened: Dataset) -> int | None:
+    """Return the number of weights, from the headers of the model's own safetensors files; None without weights."""
     count = 0
     for name in opened.files:
         if name.endswith(WEIGHTS) and name.startswith("model"):
@@ -310,12 +319,9 @@ def _align_columns(described: list[tuple[str, Any]]) -> list[str]:
     """Return names and values in two aligned columns, with long values wrapped and values of None omitted."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0) + 2
-    room = max(terminal.width_of(sys.stdout) - width, 20)
-    return [
-        f"{'' if at else name:<{width}}{line}"
-        for name, value in shown
-        for at, line in enumerate(_wrap_at_commas(value, room))
-    ]
+    text_width = max(terminal.width_of(sys.stdout) - width, 20)
+    rows = [row for name, value in shown for row in _named_once(name, _wrap_at_commas(value, text_width))]
+    return [f"{name:<{width}}{line}" for name, line in rows]
 
 
 def _wrap_at_commas(text: str, width: int) -> list[str]:

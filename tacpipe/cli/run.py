@@ -31,8 +31,8 @@ from tacpipe.plugins import registry
 if TYPE_CHECKING:
     from tacpipe.cli.stage_processes import StageProcesses
 
-PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # Option -P keeps the chain's folder off the module path.
-_SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # Syntax that needs a shell
+PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # option -P keeps the chain's folder off the module path
+_SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # syntax that needs a shell
 _PATTERN = re.compile(r"[*?\[]")
 _QUOTES = re.compile(r"[\"']")
 
@@ -47,7 +47,7 @@ class Became(Enum):
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the command ``run`` to ``program``."""
+    """Add the command ``run`` to ``program``, which exits with the code of the first failed stage."""
 
     @program.command(
         "run",
@@ -76,29 +76,29 @@ def add(program: typer.Typer, summary: str) -> None:
 
 
 def _run(chain: Chain, *, quiet: bool) -> int:
-    """Run the stages of a chain. Returns the exit code of the first failed stage, or 0."""
-    became: dict[str, Became] = {}
-    first = DONE
+    """Run the stages of a chain and print a summary. Returns the exit code of the first failed stage, or 0."""
+    outcomes: dict[str, Became] = {}
+    first_code = DONE
     for stage in chain.stages:
-        outcome = _skip_outcome(stage, chain, became)
+        outcome = _skip_outcome(stage, chain, outcomes)
         if outcome is not None:
-            became[stage.name] = outcome
+            outcomes[stage.name] = outcome
             continue
         if not quiet:
             terminal.note(f"{stage.name}:")
-        became[stage.name], code = _run_stage(stage)
+        outcomes[stage.name], code = _run_stage(stage)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         if code:
             terminal.note(f"tacpipe: {stage.name} failed with exit code {code}.")
-            first = first or code
-    _summary(became, quiet=quiet)
-    return first
+            first_code = first_code or code
+    _summary(outcomes, quiet=quiet)
+    return first_code
 
 
-def _skip_outcome(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
+def _skip_outcome(stage: ChainStage, chain: Chain, outcomes: Mapping[str, Became]) -> Became | None:
     """Return the outcome of a stage that must not run, because a dependency failed or it is frozen; otherwise None."""
-    missing = sorted(name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED))
+    missing = sorted(name for name in chain.after[stage.name] if outcomes.get(name) in (Became.FAILED, Became.BLOCKED))
     if missing:
         terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
         return Became.BLOCKED
@@ -119,29 +119,29 @@ class _Together:
         self._chain, self._processes, self._quiet = chain, processes, quiet
         self._waiting = list(chain.stages)
         self._at_work: dict[str, tuple[ChainStage, list[str]]] = {}  # Running stages with their remaining commands
-        self.became: dict[str, Became] = {}
-        self.first = DONE  # First nonzero exit code
+        self.outcomes: dict[str, Became] = {}
+        self.first_code = DONE  # first nonzero exit code
 
     def run(self) -> None:
-        """Run all stages."""
+        """Run all stages. Raises `KeyboardInterrupt` if a command was interrupted."""
         while self._waiting or self._processes.busy:
             while self._processes.free and (stage := next(self._ready_stages(), None)) is not None:
                 self._waiting.remove(stage)
-                outcome = _skip_outcome(stage, self._chain, self.became)
+                outcome = _skip_outcome(stage, self._chain, self.outcomes)
                 if outcome is None:
                     self._announce(f"{stage.name}:")
                     self._advance(stage, list(stage.commands), Became.UNCHANGED)
                 else:
-                    self.became[stage.name] = outcome
+                    self.outcomes[stage.name] = outcome
             if self._processes.busy:
                 self._end(*self._processes.next(before=self._announce))
 
     def _ready_stages(self) -> Iterator[ChainStage]:
         """Yield the stages whose dependencies are done."""
-        finished = self.became.keys()
+        finished = self.outcomes.keys()
         return (stage for stage in self._waiting if self._chain.after[stage.name] <= finished)
 
-    def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
+    def _advance(self, stage: ChainStage, commands: list[str], outcome: Became) -> None:
         """Start the stage's next command that is not up to date; if none remains, record the outcome of the stage."""
         while commands:
             command = commands.pop(0)
@@ -153,17 +153,21 @@ class _Together:
             concurrent_count = min(self._processes.jobs, len(self._at_work) + sum(1 for _ in self._ready_stages()))
             self._processes.start(stage.name, command if words is None else words[1:], concurrent_count)
             return
-        self.became[stage.name] = became
+        self.outcomes[stage.name] = outcome
 
     def _end(self, name: str, code: int) -> None:
+        """Record the end of a stage's command: start its next one, or record that the stage failed.
+
+        Raises `KeyboardInterrupt` if it was interrupted.
+        """
         stage, commands = self._at_work.pop(name)
         if code == INTERRUPTED:
             raise KeyboardInterrupt
         if not code:
             self._advance(stage, commands, Became.RAN)
             return
-        self.became[name] = Became.FAILED
-        self.first = self.first or code
+        self.outcomes[name] = Became.FAILED
+        self.first_code = self.first_code or code
         terminal.note(f"tacpipe: {name} failed with exit code {code}.")
 
     def _announce(self, sentence: str) -> None:
@@ -183,22 +187,22 @@ def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
     ):
         scheduler = _Together(chain, processes, quiet=quiet)
         scheduler.run()
-    _summary(scheduler.became, quiet=quiet)
-    return scheduler.first
+    _summary(scheduler.outcomes, quiet=quiet)
+    return scheduler.first_code
 
 
 def _run_stage(stage: ChainStage) -> tuple[Became, int]:
     """Run a stage's commands until one fails. Returns the stage's outcome and the exit code."""
-    became = Became.UNCHANGED
+    outcome = Became.UNCHANGED
     for command in stage.commands:
         words = _words(command)
         if words is not None and _report_if_current(words[1:]):
             continue
-        became = Became.RAN
+        outcome = Became.RAN
         code = _run_process(command if words is None else [*PROGRAM, *words[1:]])
         if code:
             return Became.FAILED, code
-    return became, DONE
+    return outcome, DONE
 
 
 def _words(command: str) -> list[str] | None:
@@ -241,7 +245,10 @@ def _report_if_current(arguments: Sequence[str]) -> bool:
 
 
 def _run_process(command: str | list[str]) -> int:
-    """Run a command and return its exit code; a string is run by the shell. The command itself reports interrupts."""
+    """Run a command and return its exit code, 128 + the signal that ended it; a string is run by the shell.
+
+    The command itself reports interrupts.
+    """
     sys.stdout.flush()
     shell = isinstance(command, str)
     with termination.reporting(""):

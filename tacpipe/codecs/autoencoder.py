@@ -59,9 +59,9 @@ class Autoencoder:
         return _apply_layers(self.encoder, standardise(inputs, self.mean_count, self.scale_count))
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
-        """Decode latents (…, latent) to the newest frame's counts (…, channel), float64."""
-        *first, (weight, bias) = self.decoder
-        newest = (*first, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
+        """Return the newest frame's counts (…, channel), float64, decoded from latents (…, latent)."""
+        *hidden_layers, (weight, bias) = self.decoder
+        newest = (*hidden_layers, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
         decoded = _apply_layers(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))
         counts: AnyFloats = decoded * self.scale_count + self.mean_count
         return counts.reshape(*latents.shape[:-1], len(self.channels))
@@ -107,16 +107,14 @@ class Autoencoder:
 
 
 def standardise(inputs: AnyFloats, mean_count: AnyFloats, scale_count: AnyFloats) -> AnyFloats:
-    """Standardise rows (row, frames * channel) by the mean and scale of each channel; float32."""
+    """Return rows (row, frames * channel) standardised by the mean and scale of each channel; float32."""
     frames = inputs.shape[1] // len(mean_count)
-    inputs_scaled: AnyFloats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(
-        np.float32
-    )
-    return inputs_scaled
+    scaled: AnyFloats = (inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)
+    return scaled.astype(np.float32)
 
 
 def _apply_layers(layers: Layers, rows: AnyFloats) -> AnyFloats:
-    """Apply ``layers`` to ``rows`` (row, in) and return (row, out)."""
+    """Return ``rows`` (row, in) after ``layers``, with an ELU between them (row, out); float32."""
     outputs = np.empty((len(rows), len(layers[-1][1])), dtype=np.float32)
     for first in range(0, len(rows), CHUNK):
         hidden = rows[first : first + CHUNK]

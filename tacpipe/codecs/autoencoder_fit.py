@@ -71,9 +71,8 @@ def candidate_networks(
     if not search:
         return [NetworkShape(_parse_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
     candidates = [
-        NetworkShape(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
-        for fast, decay in STEPS
-        for shape in SHAPES
+        NetworkShape(tuple(frames * width for width in shape), learning_rate * rate_factor, weight_decay * decay_factor)
+        for (rate_factor, decay_factor), shape in itertools.product(STEPS, SHAPES)
     ]
     return candidates[:search]
 
@@ -122,14 +121,14 @@ def fit(
     codec = Autoencoder(
         rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
     )
-    described = [
-        _record(network, trained, kept=at == best)
-        for at, (network, trained) in enumerate(zip(candidates, results, strict=True))
+    search_records = [
+        _record(network, trained, kept=index == best)
+        for index, (network, trained) in enumerate(zip(candidates, results, strict=True))
     ]
     measured: measures.CodecMeasures = {
         "reconstruction": measures.reconstructions(codec, {"train": [train], "val": [val]}),
         "latent_covariance": measures.covariance(codec.project(train)),
-        "search": described,
+        "search": search_records,
     }
     return replace(codec, measured=measured)
 
@@ -148,10 +147,10 @@ class _MirroredNetwork(nn.Module):
 
 
 def _stack(widths: Sequence[int], bias: bool) -> nn.Sequential:
-    """Return linear layers between the widths, with ELUs between them."""
+    """Return linear layers between successive widths, with ELUs between them."""
     layers: list[nn.Module] = []
-    for before, after in itertools.pairwise(widths):
-        layers += [nn.Linear(before, after, bias=bias), nn.ELU()]
+    for in_width, out_width in itertools.pairwise(widths):
+        layers += [nn.Linear(in_width, out_width, bias=bias), nn.ELU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -165,9 +164,13 @@ def _train_network(
     components: int,
     representation: str,
 ) -> loop.TrainingResult:
+    """Train a network that reproduces its inputs, and return its best weights; ``workspace`` keeps it after interruptions.
+
+    ``position`` and the number of candidates are shown while it trains.
+    """
     widths, (index, count) = (train_tensor.shape[1], *network.hidden, components), position
 
-    def part(rows: Tensor) -> loop.WindowSet:
+    def window_set(rows: Tensor) -> loop.WindowSet:
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
             picked = rows[indices]
             return nn.functional.mse_loss(model(picked), picked)
@@ -176,7 +179,7 @@ def _train_network(
 
     return loop.train(
         lambda: _MirroredNetwork(widths, bias=representation == codecs.LEVELS).to(train_tensor.device),
-        loop.WindowTraining(part(train_tensor), part(val_tensor), schedule.batch),
+        loop.WindowTraining(window_set(train_tensor), window_set(val_tensor), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace / f"{index:02d}",
         weight_decay=network.weight_decay,
@@ -207,12 +210,16 @@ def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[AnyFloats, Any
     """Return the weight and the bias of each layer of ``part``, encoder or decoder; missing biases are zeros."""
     tensors = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
     indices = sorted({int(name.split(".")[1]) for name in tensors})
-    pairs = ((tensors[f"{part}.{at}.weight"], tensors.get(f"{part}.{at}.bias")) for at in indices)
-    return tuple((w, np.zeros(len(w), dtype=np.float32) if b is None else b) for w, b in pairs)
+    layers = []
+    for index in indices:
+        weight = tensors[f"{part}.{index}.weight"]
+        bias = tensors.get(f"{part}.{index}.bias", np.zeros(len(weight), dtype=np.float32))
+        layers.append((weight, bias))
+    return tuple(layers)
 
 
 def _parse_widths(text: str) -> tuple[int, ...]:
-    """Parse widths such as ``64,32``."""
+    """Parse widths such as ``64,32``. Raises `TacpipeError` unless they are positive integers."""
     pieces = [piece.strip() for piece in text.split(",")]
     if not all(piece.isascii() and piece.isdecimal() and int(piece) > 0 for piece in pieces):
         raise TacpipeError(

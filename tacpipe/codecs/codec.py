@@ -38,12 +38,13 @@ def codec_inputs(values: AnyFloats, begins: Bools | None, representation: str, f
     check_representation(representation)
     rows = np.arange(len(values))
     first = np.zeros_like(rows) if begins is None else np.maximum.accumulate(np.where(begins, rows, 0))
+    frame_values = values
     if representation == INCREMENTS:
         with np.errstate(invalid="ignore"):  # a row that is not finite has no increment, not even at the start of a run
-            values = values - values[np.maximum(rows - 1, first)]
+            frame_values = values - values[np.maximum(rows - 1, first)]
     if frames == 1:
-        return values
-    return np.hstack([values[np.maximum(rows - lag, first)] for lag in reversed(range(frames))])
+        return frame_values
+    return np.hstack([frame_values[np.maximum(rows - lag, first)] for lag in reversed(range(frames))])
 
 
 class Stacking:
@@ -60,15 +61,15 @@ class Stacking:
         self._begins = np.zeros(0, dtype=bool)
 
     def next(self, values: AnyFloats, begins: Bools) -> AnyFloats:
-        """Return the inputs of the next rows.
+        """Return the inputs of the next rows, which continue the previous ones.
 
         ``values`` (time, channel) and ``begins`` (time,) are those of `codec_inputs`.
         """
-        before = len(self._begins)
-        if self._values is not None:
-            values, begins = np.concatenate([self._values, values]), np.concatenate([self._begins, begins])
-        self._values, self._begins = values[-self._frames :], begins[-self._frames :]
-        return codec_inputs(values, begins, self._representation, self._frames)[before:]
+        previous_count = len(self._begins)
+        previous_values = values[:0] if self._values is None else self._values
+        all_values, all_begins = np.concatenate([previous_values, values]), np.concatenate([self._begins, begins])
+        self._values, self._begins = all_values[-self._frames :], all_begins[-self._frames :]
+        return codec_inputs(all_values, all_begins, self._representation, self._frames)[previous_count:]
 
 
 DESCRIPTION, TENSORS = "codec.json", "codec.safetensors"
@@ -153,7 +154,7 @@ class Raw:
 
 
 def decode_ahead(codec: Codec, latents: AnyFloats, last: AnyFloats) -> AnyFloats:
-    """Decode the latents of future rows to counts above rest, shape (window, step, channel).
+    """Return counts above rest of future rows, shape (window, step, channel), decoded from their latents.
 
     ``latents`` is (window, step, latent), its first step the row after ``last`` (window, channel), which is in counts
     above rest. A codec of increments adds them to ``last``; a codec of levels ignores it.
@@ -163,7 +164,7 @@ def decode_ahead(codec: Codec, latents: AnyFloats, last: AnyFloats) -> AnyFloats
 
 
 def encode_finite(project: Callable[[AnyFloats], AnyFloats], inputs: AnyFloats, width: int) -> AnyFloats:
-    """Apply ``project`` to the finite rows of ``inputs``, and return (time, ``width``), float32; other rows are NaN."""
+    """Return ``project`` of the finite rows of ``inputs``, (time, ``width``), float32; other rows are NaN."""
     finite = np.isfinite(inputs).all(axis=1)
     latents = np.full((len(inputs), width), np.nan, dtype=np.float32)
     latents[finite] = project(inputs[finite])
@@ -174,12 +175,12 @@ def check_channels(expected: Sequence[str], channels: Sequence[str]) -> None:
     """Raise `TacpipeError` unless ``channels`` are those that the codec was fitted on, in the same order."""
     if tuple(expected) == tuple(channels):
         return
-    at = next((i for i, pair in enumerate(zip(expected, channels, strict=False)) if pair[0] != pair[1]), None)
-    if at is None:
-        differ = f"it was fitted on {len(expected)} channels and is given {len(channels)}"
+    position = next((i for i, pair in enumerate(zip(expected, channels, strict=False)) if pair[0] != pair[1]), None)
+    if position is None:
+        difference = f"it was fitted on {len(expected)} channels and is given {len(channels)}"
     else:
-        differ = f"channel {at + 1} is {channels[at]} where it was fitted on {expected[at]}"
-    raise TacpipeError(f"The codec does not fit this table: {differ}. Fit one on recordings of this rig.")
+        difference = f"channel {position + 1} is {channels[position]} where it was fitted on {expected[position]}"
+    raise TacpipeError(f"The codec does not fit this table: {difference}. Fit one on recordings of this rig.")
 
 
 def latent_names(count: int) -> tuple[str, ...]:
@@ -201,7 +202,7 @@ PLUGIN = "plugin"  # field of `codec.json`: the package and version of a codec f
 
 
 def load(files: Mapping[str, bytes]) -> FittedCodec:
-    """Load the codec from `codec.json` and `codec.safetensors` in ``files``.
+    """Return the codec in `codec.json` and `codec.safetensors` of ``files``.
 
     Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` if a file is missing, the kind is
     not installed, or the parts do not match.
@@ -254,7 +255,10 @@ def check_latents(codec: Codec, latents: AnyFloats, rows: int) -> None:
 
 
 def _load_checked(read: Callable[[], FittedCodec]) -> FittedCodec:
-    """Load a codec and apply it to a row of zeros. Raises `TacpipeError` if its parts do not match."""
+    """Return the codec that ``read`` returns, after applying it to a row of zeros.
+
+    Raises `TacpipeError` if its parts do not match.
+    """
     with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()
         if codec.representation not in (LEVELS, INCREMENTS) or not all(

@@ -38,10 +38,10 @@ class _Network(nn.Module):
         super().__init__()
         encoder_layers: list[nn.Module] = []
         decoder_layers: list[nn.Module] = []
-        for number, (before, after) in enumerate(itertools.pairwise(CHANNELS)):
-            encoder_layers += [nn.Conv2d(before, after, 4, 2, 1), nn.ELU()]
+        for number, (in_channels, out_channels) in enumerate(itertools.pairwise(CHANNELS)):
+            encoder_layers += [nn.Conv2d(in_channels, out_channels, 4, 2, 1), nn.ELU()]
             decoder_layers = [
-                nn.ConvTranspose2d(after, before, 4, 2, 1),
+                nn.ConvTranspose2d(out_channels, in_channels, 4, 2, 1),
                 *([nn.ELU()] if number else []),
                 *decoder_layers,
             ]
@@ -72,10 +72,11 @@ def reduce_image(image: Bytes) -> Bytes:
 def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path, components: int) -> bytes:
     """Train an encoder with ``components`` features and return its weights as a safetensors file.
 
-    ``train`` and ``held_out`` are reduced images, uint8 (image, row, column, rgb).
+    ``train`` and ``held_out`` are reduced images, uint8 (image, row, column, rgb); the latter determine when to stop.
+    ``workspace`` keeps the training after an interruption.
     """
 
-    def part(images: Bytes) -> loop.WindowSet:
+    def window_set(images: Bytes) -> loop.WindowSet:
         pixels = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))).to(devices.kind())
 
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
@@ -84,7 +85,7 @@ def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path,
 
         return loop.WindowSet(len(pixels), loss)
 
-    training = loop.WindowTraining(part(train), part(held_out), schedule.batch)
+    training = loop.WindowTraining(window_set(train), window_set(held_out), schedule.batch)
     trained = loop.train(lambda: _Network(components).to(devices.kind()), training, schedule, workspace)
     encoder = {name: value.cpu().contiguous() for name, value in trained.weights.items() if name.startswith("encoder.")}
     return save(encoder)

@@ -181,21 +181,21 @@ class Moments:
 
     @classmethod
     def from_pieces(cls, pieces: Iterable[AnyFloats], width: int) -> Moments:
-        """Return the moments of chunks of rows."""
+        """Return the moments of chunks of rows (row, channel), given the number of channels."""
         moments = cls(width)
         for piece in pieces:
             moments.add(piece)
         return moments
 
     def add(self, rows: AnyFloats) -> None:
-        """Add rows (row, channel)."""
+        """Add rows (row, channel) to the moments."""
         if len(rows):
             self.count += len(rows)
             self._low, self._high = np.minimum(self._low, rows.min(axis=0)), np.maximum(self._high, rows.max(axis=0))
             self._extend(np.column_stack([np.ones(len(rows)), rows]))
 
     def merge(self, further: Moments) -> Moments:
-        """Return the moments of both sets of rows."""
+        """Return the moments of both sets of rows, without changing either."""
         merged = Moments(len(self._low))
         merged.count = self.count + further.count
         merged._low, merged._high = np.minimum(self._low, further._low), np.maximum(self._high, further._high)
@@ -215,7 +215,10 @@ class Moments:
         return triangle
 
     def mean_and_scale(self, representation: str) -> tuple[AnyFloats, AnyFloats]:
-        """Return mean and scale of each channel, both (channel,), as `tacpipe.codecs.measures.mean_and_scale`."""
+        """Return mean and scale of each channel, both (channel,), as `tacpipe.codecs.measures.mean_and_scale`.
+
+        Raises `TacpipeError` if all channels are constant.
+        """
         if not self.varies.any():
             raise no_moving_channel_error(len(self._low), self.count)
         spread = np.sqrt(np.square(self.centred_triangle).sum(axis=0) / self.count)
@@ -223,7 +226,10 @@ class Moments:
         return mean, np.where(self.varies, spread, 1.0)
 
     def standardised_triangle(self, representation: str) -> AnyFloats:
-        """Return the triangular factor (channel, channel) of the standardised rows."""
+        """Return the triangular factor (channel, channel) of the standardised rows.
+
+        Raises the errors of `mean_and_scale`.
+        """
         _, scale = self.mean_and_scale(representation)
         if representation == LEVELS:
             return self.centred_triangle / scale

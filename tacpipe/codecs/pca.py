@@ -138,12 +138,12 @@ def fit(
     # scikit-learn's PCA always subtracts the mean, which increments must keep. The triangular factor of a QR
     # decomposition has the same singular values and right vectors as all rows, and only as many rows as there are
     # channels.
-    _, singular, weights = np.linalg.svd(rows.standardised_triangle(representation))
+    _, singular, all_weights = np.linalg.svd(rows.standardised_triangle(representation))
     power = singular**2
     ratio = power / power.sum()
     count = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
     count = min(count, limit)
-    weights = weights[:count]  # (latent, channel)
+    weights = all_weights[:count]  # (latent, channel)
     largest = np.take_along_axis(weights, np.abs(weights).argmax(axis=1)[:, None], axis=1)
     return PCA(
         tuple(channels),
@@ -159,11 +159,11 @@ def fit(
 def fit_and_measure(
     rows: CodecRows, *, components: int = 20, variance: float = 0.0, representation: str = codecs.LEVELS
 ) -> PCA:
-    """Fit the codec on ``rows`` of all recordings and measure it; the rows are read twice, in chunks.
+    """Return the codec fitted on ``rows`` of all recordings, with its measures; the rows are read twice, in chunks.
 
     The errors are those of a PCA with as many components, fitted without the held-out recordings, so that they compare
     with those of an autoencoder. If no recordings are held out, ``val`` is omitted. Warns of constant channels, unless
-    all are.
+    all are. Raises the errors of `fit`.
     """
     validation = held_out(rows.names)
     parts: dict[str, Collection[str]] = {"train": set(rows.names) - validation, "val": validation}

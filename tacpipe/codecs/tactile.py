@@ -35,11 +35,8 @@ def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
 
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
     """Return stream, taxel and axis of each channel, if its metadata contains them."""
-    described = [field_metadata(schema.field(name)) for name in channels]
-    return [
-        {key: metadata_of_channel[key] for key in LAYOUT if key in metadata_of_channel}
-        for metadata_of_channel in described
-    ]
+    all_metadata = [field_metadata(schema.field(name)) for name in channels]
+    return [{key: about[key] for key in LAYOUT if key in about} for about in all_metadata]
 
 
 def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
@@ -102,14 +99,17 @@ def _prefix_errors(name: str) -> Iterator[None]:
 
 
 def _encode_in_chunks(name: str, stored_columns: Columns, codec: Any, begins: Bools) -> pa.RecordBatchReader:
-    """Return the rows of a recording with their latents; each chunk is encoded with the previous rows that it depends on."""
-    before = codec.reads - 1
+    """Return the rows of a recording with their latents; each chunk is encoded with the previous rows it depends on.
+
+    Raises `TacpipeError` with the recording's name, also while the rows are read.
+    """
+    previous_rows = codec.reads - 1
 
     def batches() -> Iterator[pa.RecordBatch]:
         counts: AnyFloats = np.zeros((0, len(codec.channels)))
         row = 0
         for table in stored_columns.batches():
-            lead = min(row, before)
+            lead = min(row, previous_rows)
             counts = np.concatenate([counts[len(counts) - lead :], above_rest(table, codec.channels)])
             with _prefix_errors(name):
                 latents = codec.encode(counts, codec.channels, begins[row - lead : row + table.num_rows])[lead:]
@@ -123,10 +123,14 @@ def _encode_in_chunks(name: str, stored_columns: Columns, codec: Any, begins: Bo
 
 
 def _append_latents(table: pa.Table, codec: codecs.FittedCodec, latents: AnyFloats | None) -> pa.Table:
-    """Append latents (time, latent) to a table; None appends empty columns to an empty table."""
+    """Return a table with latents (time, latent) appended as columns; None appends empty columns to an empty table.
+
+    Raises `TacpipeError` if the latents have another shape.
+    """
     values = np.zeros((0, len(codec.latents)), np.float32) if latents is None else latents
     codecs.check_latents(codec, values, table.num_rows)
+    extended = table
     for index, name in enumerate(codec.latents):
         field = pa.field(name, pa.float32(), metadata={"quantity": "latent", "unit": "1"})
-        table = table.append_column(field, pa.array(values[:, index], pa.float32()))
-    return table
+        extended = extended.append_column(field, pa.array(values[:, index], pa.float32()))
+    return extended

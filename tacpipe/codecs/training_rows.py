@@ -103,7 +103,10 @@ class StoredRows:
                 raise TacpipeError(f"{name}: {error}") from error
 
     def read(self) -> TrainingRows:
-        """Read the rows of all recordings into memory. Warns of constant channels, unless all are."""
+        """Return the rows of all recordings, read into memory. Warns of constant channels, unless all are.
+
+        Raises the errors of `pieces`.
+        """
         inputs = {name: np.concatenate([self._empty, *self.pieces([name])]) for name in sorted(self.names)}
         rows = TrainingRows(self.channels, self.layout, inputs)
         newest = rows.select(rows.names)[:, -len(self.channels) :]
@@ -116,7 +119,10 @@ class StoredRows:
         return np.zeros((0, self.frames * len(self.channels)))
 
     def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
-        """Yield chunks of the rows (row, frames * channel) of a recording that are suitable for fitting a codec."""
+        """Yield chunks of the rows (row, frames * channel) of a recording that are suitable for fitting a codec.
+
+        Raises `TacpipeError` if its channels differ.
+        """
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
         begins, gaps = codec.run_starts(tactile.times(stored)), tactile.gap_mask(stored)
         in_contact = np.ones(len(begins), dtype=bool)
@@ -125,20 +131,18 @@ class StoredRows:
         stored.forget()
         stacking, row = codec.Stacking(self.representation, self.frames), 0
         for table in stored.batches(self.channels):
-            now = slice(row, row + table.num_rows)
+            chunk = slice(row, row + table.num_rows)
             counts = tactile.above_rest(table, self.channels)
-            counts[gaps[now]] = np.nan  # makes all results of such a row NaN
-            stacked = stacking.next(counts, begins[now])
-            yield stacked[np.isfinite(stacked).all(axis=1) & in_contact[now]]
+            counts[gaps[chunk]] = np.nan  # makes all results of such a row NaN
+            stacked = stacking.next(counts, begins[chunk])
+            yield stacked[np.isfinite(stacked).all(axis=1) & in_contact[chunk]]
             row += table.num_rows
 
 
 def held_out(names: Collection[str]) -> frozenset[str]:
-    """Return the names of the recordings that measure a codec.
+    """Return the names of the recordings that measure a codec: at least one, or none if there is only one recording.
 
     The same names give the same choice, so that errors compare.
-
-    Returns at least one name, or none if there is only one recording.
     """
     if len(names) < 2:
         return frozenset()
@@ -164,7 +168,7 @@ def stored_rows(recordings: Mapping[str, Recording], representation: str, frames
 
 
 def read_rows(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
-    """Read the rows of `stored_rows` into memory.
+    """Return the rows of `stored_rows`, read into memory.
 
     Warns of constant channels, unless all are. Raises `TacpipeError` as `stored_rows`, and with the name of a recording
     whose channels differ.

@@ -29,7 +29,7 @@ _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
 def parse_folds(text: str) -> tuple[int, ...]:
     """Return the folds in an option's text, in order. Raises `UsageError` if there are none.
 
-    >>> folds("3"), folds("0-3"), parse_folds("4,0-1,1")
+    >>> parse_folds("3"), parse_folds("0-3"), parse_folds("4,0-1,1")
     ((3,), (0, 1, 2, 3), (4, 0, 1))
     """
     numbers: dict[int, None] = {}

@@ -143,8 +143,10 @@ def unknown(key: Any, names: Collection[str], place: str, noun: str) -> UsageErr
 def parse_text(text: str, annotation: Any) -> Any:
     """Return the value that ``text`` represents for an annotation, or the text itself if it represents none.
 
-    >>> parsed("3", int), parsed("3", float), parsed("3", str), parsed("x", int), parse_text("3", Literal[1, 3])
-    (3, 3.0, '3', 'x', 3)
+    >>> parse_text("3", int), parse_text("3", float), parse_text("3", str), parse_text("x", int)
+    (3, 3.0, '3', 'x')
+    >>> parse_text("3", Literal[1, 3])
+    3
     """
     kind = bare(annotation)
     if get_origin(kind) is Literal:

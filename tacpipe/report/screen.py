@@ -230,7 +230,7 @@ def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, ComparisonRow
 
 
 def _verb(comparison: Comparison, row: ComparisonRow) -> str:
-    """Return what a sentence says of a method: whether it is better and by how much, or why there is no verdict."""
+    """Return the end of a sentence on a method: whether it is better and by how much, or why there is no verdict."""
     size = counted(row.n, comparison.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"

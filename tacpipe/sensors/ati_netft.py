@@ -134,7 +134,7 @@ class _Box(Device):
     requested = 0
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Start or stop sending as a request says; other packets are ignored. There are no replies."""
+        """Start or stop sending on request; other packets are ignored. There are no replies."""
         if len(data) != REQUEST.size:
             return []
         magic, command, count = REQUEST.unpack(data)

@@ -278,7 +278,7 @@ class Board(Device):
     stop: bytes = b""
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Start or stop the stream, as the last command of the host says. There are no replies."""
+        """Start or stop the stream, according to the last command of the host. There are no replies."""
         self.heard += data
         started = self.heard.rfind(self.start) if self.start else -1
         stopped = self.heard.rfind(self.stop) if self.stop else -1

@@ -65,7 +65,7 @@ def parse_address(text: str) -> BucketAddress | Path:
 
     Raises `UsageError` for an unsupported scheme, and for an address with credentials or options.
 
-    >>> parsed("/lab/store"), parsed("file:///lab/store"), str(parse_address("s3://lab/store/"))
+    >>> parse_address("/lab/store"), parse_address("file:///lab/store"), str(parse_address("s3://lab/store/"))
     (PosixPath('/lab/store'), PosixPath('/lab/store'), 's3://lab/store')
     """
     match = _ADDRESS.fullmatch(text)

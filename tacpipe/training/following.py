@@ -137,7 +137,7 @@ def trackers() -> tuple[Follower, ...]:
 
 @contextlib.contextmanager
 def follow_network(described: TrainedNetwork, history: Sequence[Line]) -> Iterator[Followers]:
-    """Tell the followers that a network is trained in the block, and yield them; report afterwards whether it finished."""
+    """Report to the followers that a network is trained in the block, yield them, and report whether it finished."""
     followers, trained = _current.get(), False
     for follower in followers:
         follower.begin(described, history)

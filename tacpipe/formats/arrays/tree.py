@@ -134,7 +134,7 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[ArrayDescription]]]:
     """Yield ``group`` and each group below it, with its arrays.
 
-    A group with several paths is walked once; at its other paths, one array with a problem stands for it.
+    A group with several paths is walked once; at its other paths, one array with a problem represents it.
     """
     first_paths: dict[Any, str] = {}
     pending = [group]

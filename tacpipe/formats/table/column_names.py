@@ -230,7 +230,7 @@ def meanings(name: str, width: int, are_integers: bool = False) -> list[ColumnMe
 
     >>> meanings("robot0_eef_pos", 3)[0], meanings("obs/joint_pos", 7)[6].unit
     (ColumnMeaning(quantity='position', unit='m', component='x'), 'rad')
-    >>> meanings("tactile_left", 48, integers=True)[0]
+    >>> meanings("tactile_left", 48, are_integers=True)[0]
     ColumnMeaning(quantity='tactile', unit='count', component='')
     >>> meanings("tactile_slips_label", 1)[0].quantity, meanings("tactile_timestamps", 1)[0].quantity
     ('label', '')

@@ -40,8 +40,8 @@ def test_json_has_null_where_nothing_was_measured() -> None:
 @pytest.mark.parametrize("sizes", ["", "0", "4,-1", "2.5", "four"])
 def test_sizes_that_are_not_whole_numbers_from_one_are_refused(sizes: str) -> None:
     with pytest.raises(UsageError):
-        command._sizes(sizes)
+        command._parse_sizes(sizes)
 
 
 def test_sizes_are_sorted_and_each_is_tried_once() -> None:
-    assert command._sizes("8, 2,8") == [2, 8]
+    assert command._parse_sizes("8, 2,8") == [2, 8]
