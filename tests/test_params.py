@@ -325,7 +325,7 @@ def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
     values = params_of.to_json(built)
     assert {key: values[key] for key in stored} == stored
     assert params_of.from_json(stage, values) == built
-    assert {key: params_of.counting(stage, values)[key] for key in options} == options
+    assert {key: params_of.used_params(stage, values)[key] for key in options} == options
     assert {key: params_of.with_current_names(name, values)[key] for key in options} == options
     assert {key: params_of.to_input(built)[key] for key in options} == options
     with pytest.raises(UsageError):  # a former name is not an option

@@ -116,7 +116,7 @@ def test_a_system_that_does_not_allow_it_is_named_before_the_session(monkeypatch
 
     monkeypatch.setattr(os, "sched_setscheduler", refused)
     with pytest.raises(UsageError, match="rtprio 20"):
-        wire.check()
+        wire.check_realtime()
     wire.realtime(wire.MODEL)  # a process whose rights ended meanwhile goes on as ever
     wire.ordinary()
 
