@@ -189,7 +189,7 @@ def test_a_note_is_written_anew_where_many_shelves_changed(
     (stored.parent / "x").touch()
     noted.run(SCALE)
     assert shows == [] and note.read_bytes() != before
-    monkeypatch.setattr(presence.Look, "_lie", lambda *arguments: False)  # nothing is looked at now
+    monkeypatch.setattr(presence.Look, "_are_intact", lambda *arguments: False)  # nothing is looked at now
     noted.run(SCALE)
     assert shows == []
 
