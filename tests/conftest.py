@@ -165,6 +165,14 @@ def eight_cores(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
+@pytest.fixture
+def unbundled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of results hold a mark in place of the library of charts, because bundling takes a second."""
+    from tacpipe.report import page
+
+    monkeypatch.setattr(page, "bundle", lambda: "/* library */")
+
+
 @dataclass
 class Ran:
     """Exit code and output of a command."""

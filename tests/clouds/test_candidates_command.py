@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import sys
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -90,7 +91,7 @@ def test_a_terminal_gets_a_table_with_the_mean_of_the_electrodes(
     lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(candidates_command, "_predict_grasp", lambda path: partial(grasp_values, cast(Any, Model())))
-    monkeypatch.setattr(candidates_command, "_on_terminal", lambda: True)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "160")
     printed = lab.run("candidates bottle.ply --model models/touch --count 2").out.splitlines()
     heading = next(line for line in printed if "score" in line)

@@ -12,8 +12,8 @@ from tacpipe.codecs import autoencoder_fit, codec, pca
 from tacpipe.codecs.autoencoder import Autoencoder
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
-from tacpipe.training import loop
 from tacpipe.training.loop import Schedule
+from tests.training.followers import interrupted
 
 CHANNELS = tuple(f"c{index:02d}" for index in range(12))
 LAYOUT = tuple({"stream": "xela1", "axis": "xyz"[index % 3]} for index in range(12))
@@ -176,19 +176,9 @@ def test_weights_that_decay_are_smaller(tmp_path: Path) -> None:
     assert sizes[1] < sizes[0]
 
 
-def test_a_search_that_was_interrupted_goes_on_to_the_same_codec(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_search_that_was_interrupted_goes_on_to_the_same_codec(tmp_path: Path) -> None:
     uninterrupted = fit(tmp_path / "whole", hidden="", search=3)
-    real, remaining = loop.train, iter([1, 2])
-
-    def dies(*args: object, **kwargs: object) -> object:
-        if next(remaining, None) is None:
-            raise KeyboardInterrupt
-        return real(*args, **kwargs)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(loop, "train", dies)
+    with interrupted(tmp_path / "torn", networks=3):
         fit(tmp_path / "torn", hidden="", search=3)
     assert fit(tmp_path / "torn", hidden="", search=3).to_files() == uninterrupted.to_files()
 

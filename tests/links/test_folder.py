@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,7 @@ def test_a_file_that_is_written_in_several_openings_comes_when_it_holds_still(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr("tacpipe.links.folder.time.monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     link = open_address(f"folder:{tmp_path}", Quiet())
     (tmp_path / "a").write_bytes(b"1")
     assert link.read(0) == []

@@ -169,7 +169,7 @@ def test_a_device_without_the_right_to_it_tells_the_rule_to_write(
 
     module = type("Hidapi", (), {"device": Refusing, "enumerate": staticmethod(lambda: [interface(0, 0xFFAB)])})
     monkeypatch.setattr(ports, "hid_module", lambda: module)
-    monkeypatch.setattr("tacpipe.links.hid.os.access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_: False)
 
     with pytest.raises(DeviceError) as refused:
         hid.open_hid("16c0:0486", RAW, "Stream probe")

@@ -74,8 +74,8 @@ def test_what_the_network_answers_becomes_a_sentence(
     def refuse(*_: object, **__: object) -> socket.socket:
         raise error
 
-    monkeypatch.setattr("tacpipe.links.network.socket.create_connection", refuse)
-    monkeypatch.setattr("tacpipe.links.network.socket.getaddrinfo", refuse)
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
     for scheme in ("tcp", "tcp+udp", "udp", "ws"):
         with pytest.raises(DeviceError, match=re.escape(f"Stream probe ({scheme}:arm.lab:7): {message}")):
             open_address(f"{scheme}:arm.lab:7", Quiet())

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import termios
+import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -76,7 +77,7 @@ def test_what_comes_while_a_device_boots_is_thrown_away(
         slept.append(seconds)
         os.write(terminal[0], b"Hello from the bootloader\r\n")
 
-    monkeypatch.setattr("tacpipe.links.ports.time.sleep", boot)
+    monkeypatch.setattr(time, "sleep", boot)
     link = open_address(f"serial:{terminal[1]}", Booting())
     os.write(terminal[0], b"frame")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import socket
 import struct
 import time
@@ -102,7 +103,7 @@ def test_a_listening_link_answers_whoever_spoke_last() -> None:
 
 
 def test_a_port_that_is_taken_names_its_holder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.links.ports.os.getpid", lambda: -1)  # This process then counts as another one
+    monkeypatch.setattr(os, "getpid", lambda: -1)  # This process then counts as another one
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
         holder.bind(("0.0.0.0", 0))
         port = holder.getsockname()[1]

@@ -99,11 +99,7 @@ def poison(result: Any, words: Words) -> Any:
     return FakeDataset({recording.name: recording for recording in shards}, files, rename_words(result.manifest, words))
 
 
-@pytest.fixture(autouse=True)
-def unbundled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "bundle", lambda: "/* library */")
-
-
+pytestmark = pytest.mark.usefixtures("unbundled")
 NOTE = "note"
 RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # results, and what is named by users in them
     "forward": (lambda: [result_fakes.result()], ("r1", "r3", "PCA-20", "recurrent", "ab" * 32, "synchronize")),

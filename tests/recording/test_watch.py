@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from tacpipe.errors import UsageError
-from tacpipe.io import terminal
 from tacpipe.links.link import Address, parse
 from tacpipe.recording import clock, rig
 from tacpipe.recording import watch as view_of
@@ -130,7 +129,7 @@ def test_a_map_has_rows_of_sixteen(force: Watch) -> None:
 
 def test_a_terminal_shows_the_view_and_is_left_clean(force: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
-    monkeypatch.setattr(terminal, "is_visible", lambda: True)
+    monkeypatch.setattr(screen, "isatty", lambda: True)
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr(view_of, "REFRESH_HZ", 1000.0)
     monkeypatch.setattr("rich.console.Console.is_terminal", True)

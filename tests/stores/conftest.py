@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tacpipe.io import threads
+from tacpipe.store import bucket
 from tests.stores import azurite, places, proxy
 from tests.stores.places import Place
 from tests.stores.proxy import Proxy
@@ -32,6 +34,19 @@ def azure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         pytest.skip("Azurite is not installed: npm install -g azurite")
     with azurite.served(tmp_path_factory.mktemp("azurite")) as endpoint:
         yield endpoint
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retries follow soon, and there are few."""
+    monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
+    monkeypatch.setattr(bucket, "RETRIES", 0)
+
+
+@pytest.fixture
+def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Requests follow each other, so that a step is the same one each time."""
+    monkeypatch.setattr(threads, "map_in_threads", lambda work, items, at_once: map(work, items))
 
 
 @pytest.fixture

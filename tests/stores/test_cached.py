@@ -19,7 +19,7 @@ from tacpipe.engine import computing
 from tacpipe.engine.keys import Done, WorkerTask, identity
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
-from tacpipe.store import bucket, cached, location, records
+from tacpipe.store import cached, location, records
 from tacpipe.store.addresses import BucketAddress, parse_address
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.cached import CachedStore
@@ -43,10 +43,8 @@ EVERY = pytest.mark.parametrize(
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Retries follow soon, and clients of other tests are forgotten."""
-    monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
-    monkeypatch.setattr(bucket, "RETRIES", 0)
+def new_clients(impatient: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clients of other tests are forgotten."""
     monkeypatch.setattr(cached, "_buckets", {})
     monkeypatch.setattr(cached, "_stores", set())
 
@@ -661,14 +659,6 @@ def steps(
     run()
     assert files.steps > 10
     return range(1, files.steps + 1, stride)
-
-
-@pytest.fixture
-def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Requests follow each other, so that a step is the same one each time."""
-    from tacpipe.io import threads
-
-    monkeypatch.setattr(threads, "map_in_threads", lambda work, items, at_once: map(work, items))
 
 
 STEPS = pytest.mark.parametrize(

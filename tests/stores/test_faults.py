@@ -23,11 +23,7 @@ EVERY = pytest.mark.parametrize(
 LASTING = ("refused", "503", "cut upload", "cut answer")
 
 
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Retries follow soon."""
-    monkeypatch.setattr(bucket, "PAUSE_S", 0.001)
-    monkeypatch.setattr(bucket, "RETRIES", 0)
+pytestmark = pytest.mark.usefixtures("impatient")
 
 
 @pytest.fixture

@@ -1,13 +1,12 @@
 """Test every order of a push and a concurrent operation in a store without locks."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
-from tacpipe.io import threads
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.maintenance import copying, remote_upkeep, transfer
 from tacpipe.store.bucket import Bucket
@@ -16,19 +15,11 @@ from tests.conftest import Lab
 from tests.promises.counts import count
 from tests.stores.stepping import Stepping
 
-Item = TypeVar("Item")
 FOLDERS = ("", "objects", "records", "roots", "snapshots", "leases", "tmp")
 EVERY = pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.faults), 7])
 
 
-@pytest.fixture(autouse=True)
-def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Requests follow each other, so that a step is the same one each time."""
-
-    def map_in_order(work: Callable[[Item], object], items: Iterable[Item], at_once: int) -> Iterator[object]:
-        return map(work, items)
-
-    monkeypatch.setattr(threads, "map_in_threads", map_in_order)
+pytestmark = pytest.mark.usefixtures("one_at_a_time")
 
 
 def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **options: Any) -> None:

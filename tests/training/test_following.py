@@ -7,7 +7,8 @@ import errno
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,33 +19,8 @@ from tacpipe.io import terminal, termination
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, TrainedNetwork
 from tacpipe.training.loop import Loss, TrainingResult, WindowSet, WindowTraining, train
+from tests.training.followers import Seen
 from tests.training.test_loop import SCHEDULE, build, interrupted_after, loss, run, same
-
-
-class Seen:
-    """A follower that keeps what it was called with."""
-
-    def __init__(self, act: Callable[[], None] = lambda: None) -> None:
-        self.networks: list[tuple[TrainedNetwork, list[Line]]] = []
-        self.passed: list[float] = []
-        self.losses: list[float] = []
-        self.lines: list[tuple[Line, float]] = []
-        self.ends: list[bool] = []
-        self.act = act
-
-    def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
-        self.networks.append((network, list(history)))
-
-    def batch(self, passed: float, mean: Callable[[], float]) -> None:
-        self.passed.append(passed)
-        self.losses.append(mean())
-
-    def line(self, line: Line, learning_rate: float) -> None:
-        self.act()
-        self.lines.append((line, learning_rate))
-
-    def end(self, *, trained: bool) -> None:
-        self.ends.append(trained)
 
 
 def followed(folder: Path, *followers: following.Follower, training: Loss = loss) -> TrainingResult:
@@ -202,7 +178,7 @@ def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remaining_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terminal, "is_visible", lambda: True)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr(display, "REDRAW_S", 0.0)
     drawn: list[tuple[str, float, str]] = []
     with display.followers_on_stderr("train", tmp_path) as displays:

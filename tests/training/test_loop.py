@@ -161,15 +161,16 @@ def test_the_rate_is_the_same_throughout_without_a_cycle() -> None:
     assert {SCHEDULE.rate(progress / 10) for progress in range(11)} == {SCHEDULE.learning_rate}
 
 
-def test_the_optimiser_steps_at_the_rate_of_all_epochs_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_optimiser_steps_at_the_rate_of_all_epochs_passed(tmp_path: Path) -> None:
     positions: list[float] = []
 
-    def rate(schedule: Schedule, progress: float) -> float:
-        positions.append(progress)
-        return 0.0
+    class StillSchedule(Schedule):
+        def rate(self, progress: float) -> float:
+            positions.append(progress)
+            return 0.0
 
-    monkeypatch.setattr(Schedule, "rate", rate)
-    trained = run(tmp_path, schedule=dataclasses.replace(SCHEDULE, epochs=3, batch=20, cycle=True))
+    fields = {**dataclasses.asdict(SCHEDULE), "epochs": 3, "batch": 20, "cycle": True}
+    trained = run(tmp_path, schedule=StillSchedule(**fields))
     assert positions == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6])
     assert len({line["val_loss"] for line in trained.history}) == 1  # nothing is learned at a rate of 0
 

@@ -18,10 +18,10 @@ from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import training
 from tacpipe.tasks.forward import training as forward_training
-from tacpipe.training import loop
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, evaluated, params, trained
+from tests.training.followers import interrupted
 
 TRAIN, VAL = [motion(seed) for seed in range(3)], [motion(10), motion(11)]
 FILES = {"model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"}
@@ -203,27 +203,13 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(
     [("recurrent", "planned", 1), ("taxelwise", "planned", 1), ("gru", "shuffled", 1), ("gru", "planned", 2)],
 )
 def test_an_interrupted_training_goes_on_where_it_was(
-    architecture: str, actions: str, members: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    architecture: str, actions: str, members: int, tmp_path: Path
 ) -> None:
-    options: dict[str, Any] = {
-        "architecture": architecture,
-        "actions": actions,
-        "members": members,
-        "epochs": 4,
-        "hidden": 8,
-    }
+    options: dict[str, Any] = {"architecture": architecture, "actions": actions, "members": members}
+    options |= {"epochs": 4, "hidden": 8}
     uninterrupted = trained(tmp_path / "whole", **options)
-    writes, write = iter(range(2)), loop.write_checkpoint
-
-    def killed(*args: Any) -> None:
-        write(*args)
-        if next(writes, None) is None:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(loop, "write_checkpoint", killed)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(tmp_path / "killed", epochs=3):
         trained(tmp_path / "killed", **options)
-    monkeypatch.setattr(loop, "write_checkpoint", write)
     assert trained(tmp_path / "killed", **options) == uninterrupted
 
 

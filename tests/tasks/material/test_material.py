@@ -20,13 +20,13 @@ from tacpipe.models.readout import StatisticsClassifier, View
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import headline as headlines
-from tacpipe.tasks.material import losses
 from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
 from tacpipe.tasks.material.model import MaterialModel
-from tacpipe.training import loop
+from tacpipe.training import following
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
+from tests.training.followers import Seen, interrupted
 
 RAEC = {"architecture": "raec", "epochs": 3}
 
@@ -153,19 +153,9 @@ def uninterrupted() -> dict[str, bytes]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("calls", [1, 16, 34])
-def test_a_joint_run_killed_at_any_epoch_ends_with_the_same_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
-) -> None:
-    real, remaining = losses.JointWork.loss, iter(range(calls))
-
-    def dies(*args: Any) -> Any:
-        if next(remaining, None) is None:
-            raise KeyboardInterrupt
-        return real(*args)
-
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(losses.JointWork, "loss", dies)
+@pytest.mark.parametrize("batches", [1, 16, 34])
+def test_a_joint_run_killed_at_any_epoch_ends_with_the_same_weights(tmp_path: Path, batches: int) -> None:
+    with interrupted(tmp_path / "killed", batches=batches):
         trained(tmp_path / "killed", **{**RAEC, "epochs": 12})
     resumed = trained(tmp_path / "killed", **{**RAEC, "epochs": 12})
     assert resumed[WEIGHTS] == uninterrupted()[WEIGHTS]
@@ -245,17 +235,11 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     assert "mean_level" not in evaluated(files, slides(8, 1))[0]
 
 
-def test_networks_are_trained_by_the_loop_that_all_tasks_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[Any] = []
-    real = loop.train
-
-    def noted(*args: Any, **kwargs: Any) -> Any:
-        called.append(args[2].epochs)
-        return real(*args, **kwargs)
-
-    monkeypatch.setattr(loop, "train", noted)
-    trained(tmp_path, **RAEC, baselines=False)
-    assert called == [3]
+def test_networks_are_trained_by_the_loop_that_all_tasks_share(tmp_path: Path) -> None:
+    follower = Seen()
+    with following.in_workspace(tmp_path, follower):
+        trained(tmp_path, **RAEC, baselines=False)
+    assert [network.epochs for network, _ in follower.networks] == [3]
 
 
 def same_but(**attributes: Any) -> Any:

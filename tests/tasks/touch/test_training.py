@@ -17,7 +17,6 @@ from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.model import TouchModel
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, HISTORY, WEIGHTS
-from tacpipe.training import loop
 from tests.tasks.touch.handmade import (
     OBJECTS,
     POINTNET,
@@ -32,6 +31,7 @@ from tests.tasks.touch.handmade import (
     recordings,
     trained,
 )
+from tests.training.followers import interrupted
 
 PATCHES = {"architecture": "patches", "inputs": "xyz"}
 TREES = {"architecture": "trees"}
@@ -79,20 +79,10 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: 
     [{**PATCHES, "networks": 2}, {**POINTNET, "multi_target": False, "targets": "pdc_th,e_th", "rotation_deg": 45.0}],
 )
 @pytest.mark.parametrize("epochs", [1, 2])
-def test_an_interrupted_training_goes_on_where_it_was(
-    changed: dict[str, Any], epochs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_training_goes_on_where_it_was(changed: dict[str, Any], epochs: int, tmp_path: Path) -> None:
     options = {**changed, "epochs": 2}
     uninterrupted = trained(tmp_path / "whole", **options)
-    written, write = iter(range(epochs)), loop.write_checkpoint
-
-    def killed(*args: Any) -> None:
-        write(*args)
-        if next(written, None) is None:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(loop, "write_checkpoint", killed)
+    with interrupted(tmp_path / "killed", epochs=epochs + 1):
         trained(tmp_path / "killed", **options)
     assert trained(tmp_path / "killed", **options) == uninterrupted
 
