@@ -25,6 +25,7 @@ from tacpipe.cli import main
 from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Manifest, find
 from tacpipe.engine import provenance
+from tacpipe.io import memory
 from tacpipe.plugins import architectures, registry
 from tacpipe.store.store import Store
 
@@ -112,7 +113,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @dataclass
 class FileCalls:
-    """The files that this process opened, and the names that it gave to files, since the last `clear`."""
+    """The files that this process opened to read, and the names that it gave to files, since the last `clear`."""
 
     opened: list[str] = field(default_factory=list)
     named: list[str] = field(default_factory=list)
@@ -143,7 +144,7 @@ def file_calls() -> Iterator[FileCalls]:
 
 
 def _trace(event: str, arguments: Sequence[Any]) -> None:
-    if event == "open" and isinstance(arguments[0], str):
+    if event == "open" and isinstance(arguments[0], str) and not arguments[2] & (os.O_WRONLY | os.O_RDWR):
         _traced[0].opened.append(arguments[0])
     elif event == "os.rename":
         _traced[0].named.append(os.fspath(arguments[1]))
@@ -163,6 +164,12 @@ def eight_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     for name in (*provenance.THREADS, provenance.JOBS):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def leave_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """A function that leaves so many bytes of memory to this process."""
+    return lambda size: monkeypatch.setattr(memory, "available", lambda: size)
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.datasets import directory
-from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import ParquetTable, to_parquet
-from tacpipe.store.records import RecordingEntry
+from tacpipe.store.records import RecordingEntry, Shard
 from tacpipe.store.store import Store
 
 
@@ -81,24 +81,39 @@ def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] |
     return FakeDataset({recording.name: recording for recording in recordings}, files or {})
 
 
+def stored_entry(store: Store, tables: Mapping[str, pa.Table], attributes: Mapping[str, Any]) -> RecordingEntry:
+    """Store the streams of a recording, and return its entry in a manifest."""
+    shards: dict[str, Shard] = {
+        stream: {**store.put(to_parquet(table)).to_json(), "rows": table.num_rows}
+        for stream, table in sorted(tables.items())
+    }
+    return {"attributes": dict(sorted(attributes.items())), "shards": shards}
+
+
 def publish_dataset(
     store: Store, path: Path, tables: Mapping[str, Mapping[str, pa.Table]], **labels: list[Any]
 ) -> None:
     """Publish recordings by name and stream as a result of the stage scale, each label a list of one value per recording."""
     store.prepare()
-    entries: dict[str, RecordingEntry] = {
-        name: {
-            "attributes": {label: values[place] for label, values in labels.items() if values[place] is not None},
-            "shards": {
-                stream: {**store.put(to_parquet(table)).to_json(), "rows": table.num_rows}
-                for stream, table in streams.items()
-            },
-        }
+    entries = {
+        name: stored_entry(
+            store, streams, {label: values[place] for label, values in labels.items() if values[place] is not None}
+        )
         for place, (name, streams) in enumerate(tables.items())
     }
     manifest = Manifest("scale", 1, {"factor": 2}, recordings=entries)
     store.put(manifest.content)
     directory.publish(store, manifest, path)
+
+
+def write_dataset(folder: Path, recordings: Mapping[str, tuple[Mapping[str, pa.Table], Mapping[str, Any]]]) -> Path:
+    """Write acquired recordings, each streams and attributes, as a dataset of the project in the working directory."""
+    store = Store(Path(".tacpipe").absolute())
+    store.prepare()
+    entries = {name: stored_entry(store, *content) for name, content in recordings.items()}
+    output = Manifest(ACQUIRE, 1, {}, recordings=entries)
+    directory.change(store, folder, lambda: directory.DirectoryChange(output))
+    return folder
 
 
 def column(table: pa.Table, name: str) -> np.ndarray[Any, Any]:

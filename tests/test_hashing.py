@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tacpipe.errors import TacpipeError
 from tacpipe.io import hashing
 from tacpipe.io.hashing import bytes_digest, canonical, digest, file_digest, remembered_file_digest
+from tests.conftest import FileCalls
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -45,33 +46,19 @@ def test_the_digest_of_a_value_is_that_of_its_canonical_json() -> None:
     assert digest({"b": 1, "a": [True, None]}) == hashlib.sha256(b'{"a":[true,null],"b":1}').hexdigest()
 
 
-@pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The names of files whose content is read."""
-    names: list[str] = []
-
-    def read(path: Path | str) -> str:
-        names.append(Path(path).name)
-        return file_digest(path)
-
-    monkeypatch.setattr(hashing, "file_digest", read)
-    monkeypatch.setattr(hashing, "_remembered", {})
-    return names
-
-
 def test_a_file_that_stays_as_it_is_is_read_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_calls: FileCalls
 ) -> None:
     monkeypatch.setattr(hashing, "SETTLED_NS", -1)  # The file looks as if it had been written long ago.
     file = tmp_path / "block.npy"
     file.write_bytes(b"slides")
     assert {remembered_file_digest(path) for path in (file, str(file), file)} == {bytes_digest(b"slides")}
-    assert reads == ["block.npy"]
+    assert file_calls.take("block.npy") == 1
     (tmp_path / "other.npy").write_bytes(b"others")
     assert remembered_file_digest(tmp_path / "other.npy") == bytes_digest(b"others")
 
 
-def test_a_file_that_was_written_just_now_is_read_each_time(tmp_path: Path, reads: list[str]) -> None:
+def test_a_file_that_was_written_just_now_is_read_each_time(tmp_path: Path, file_calls: FileCalls) -> None:
     file = tmp_path / "block.npy"
     for content in (
         b"one",
@@ -79,11 +66,11 @@ def test_a_file_that_was_written_just_now_is_read_each_time(tmp_path: Path, read
     ):  # Both have the same length, and may be written within one tick of the file system's clock.
         file.write_bytes(content)
         assert remembered_file_digest(file) == remembered_file_digest(file) == bytes_digest(content)
-    assert len(reads) == 4
+    assert file_calls.take("block.npy") == 4
 
 
 def test_a_file_that_changed_is_read_again_though_its_time_was_set_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_calls: FileCalls
 ) -> None:
     monkeypatch.setattr(hashing, "SETTLED_NS", -1)
     file = tmp_path / "block.npy"
@@ -95,4 +82,4 @@ def test_a_file_that_changed_is_read_again_though_its_time_was_set_back(
         os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert file.stat().st_mtime_ns == before.st_mtime_ns
     assert remembered_file_digest(file) == bytes_digest(b"two")
-    assert len(reads) == 2
+    assert file_calls.take("block.npy") == 2

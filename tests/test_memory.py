@@ -6,6 +6,7 @@ import errno
 import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def test_what_libraries_raise_for_lack_of_memory_is_known_also_as_a_cause(error:
     "failure", [pa.ArrowMemoryError("malloc of size 65536 failed"), OSError("ZSTD_DCtx create failed")]
 )
 def test_a_table_that_memory_does_not_hold_is_not_called_damaged(
-    monkeypatch: pytest.MonkeyPatch, failure: Exception
+    monkeypatch: pytest.MonkeyPatch, leave_memory: Callable[[int], None], failure: Exception
 ) -> None:
     content = to_parquet(pa.table({"x": np.arange(10)}))
 
@@ -56,10 +57,10 @@ def test_a_table_that_memory_does_not_hold_is_not_called_damaged(
         raise failure
 
     monkeypatch.setattr(pq.ParquetFile, "read", fail)
-    monkeypatch.setattr(memory, "available", lambda: 1 << 20)
+    leave_memory(1 << 20)
     with pytest.raises(ShortageError, match="needs more memory than there is"):
         from_parquet(content)
-    monkeypatch.setattr(memory, "available", lambda: 1 << 40)
+    leave_memory(1 << 40)
     with pytest.raises(DamagedError):
         from_parquet(content)
 
@@ -99,8 +100,10 @@ def test_a_limit_of_address_space_is_answered_by_one_sentence(lab: Lab, command:
     assert line.endswith("run the same command again with more, or with a smaller --jobs.")
 
 
-def test_a_limit_is_named_and_a_library_without_room_is_not_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "available", lambda: 100 << 20)
+def test_a_limit_is_named_and_a_library_without_room_is_not_loaded(
+    monkeypatch: pytest.MonkeyPatch, leave_memory: Callable[[int], None]
+) -> None:
+    leave_memory(100 << 20)
     memory.require_library("torch")  # there is no limit: the computer may swap
     monkeypatch.setattr(resource, "getrlimit", lambda _: (512_000_000, 512_000_000))
     with pytest.raises(
@@ -110,10 +113,10 @@ def test_a_limit_is_named_and_a_library_without_room_is_not_loaded(monkeypatch: 
 
 
 def test_a_sound_recording_that_is_larger_than_what_is_left_is_not_called_damaged(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+    lab: Lab, leave_memory: Callable[[int], None]
 ) -> None:
     content = to_parquet(pa.table({"x": np.arange(20_000_000)}))
-    monkeypatch.setattr(memory, "available", lambda: 1 << 27)
+    leave_memory(1 << 27)
     with pytest.raises(ShortageError, match=r"declares 0\.2 GB of data, and 0\.1 GB of memory are left"):
         from_parquet(content)
 

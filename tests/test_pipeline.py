@@ -17,6 +17,7 @@ from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.store.records import RecordingEntry, digests
 from tests.conftest import Lab, write_source
+from tests.fake_recordings import stored_entry
 
 
 def counts(printed: str) -> tuple[int, int]:
@@ -28,12 +29,8 @@ def replace_stream(lab: Lab, path: str, recording: str, stream: str, table: pa.T
     """Give one stream of a recording other content, as a rig does that records it anew."""
     manifest = lab.manifest(path)
     entry = manifest.recordings[recording]
-    stored = lab.store.put(to_parquet(table))
-    changed_entry: RecordingEntry = {
-        **entry,
-        "shards": {**entry["shards"], stream: {**stored.to_json(), "rows": table.num_rows}},
-    }
-    recordings = {**manifest.recordings, recording: changed_entry}
+    shards = {**entry["shards"], **stored_entry(lab.store, {stream: table}, {})["shards"]}
+    recordings: dict[str, RecordingEntry] = {**manifest.recordings, recording: {**entry, "shards": shards}}
     changed = Manifest(manifest.stage, manifest.version, manifest.params, recordings=recordings)
     lab.store.put(changed.content)
     directory.publish(lab.store, changed, lab.folder / path)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import StorageError
-from tacpipe.io import memory, regular
+from tacpipe.io import regular
 from tests.promises.limits import GIB, bound_memory, is_sentence
 
 TERA = 3 * 10**12
@@ -102,10 +102,10 @@ def test_a_file_of_three_terabytes_is_refused_before_it_is_read(tmp_path: Path) 
 
 
 def test_json_that_does_not_fit_into_memory_is_refused_and_not_called_damaged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, leave_memory: Callable[[int], None]
 ) -> None:
     (tmp_path / "file").write_bytes(b"[" + b"[]," * 2**20 + b"[]]")
     assert len(regular.json_value(tmp_path / "file")) == 2**20 + 1
-    monkeypatch.setattr(memory, "available", lambda: 2**26)
+    leave_memory(2**26)
     with pytest.raises(StorageError, match="parsed"):
         regular.json_value(tmp_path / "file")

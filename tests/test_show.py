@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +18,7 @@ from tacpipe.cli import show, show_recording
 from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
 from tests.conftest import Lab, write_source
+from tests.fake_recordings import write_dataset
 
 MANY = 12
 
@@ -141,14 +141,12 @@ def test_a_recording_is_shown_with_streams_columns_rates_gaps_and_labels(lab: La
     assert missing.code == 2 and "no recording 'trial-009'" in missing.err
 
 
-def test_events_and_labels_of_rows_are_shown_at_their_times(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_events_and_labels_of_rows_are_shown_at_their_times(lab: Lab) -> None:
     from tests.viewer import hand
 
     recording = hand.recording()
-    recording.sizes = dict.fromkeys(recording.streams, 1)  # type: ignore[attr-defined]
-    opened = type("Opened", (dict,), {"source": SimpleNamespace(stage="acquire")})({recording.name: recording})
-    monkeypatch.setattr(show_recording, "_open", lambda path: opened)
-    text = show_recording.to_text(show_recording.overview(lab.folder, recording.name))
+    write_dataset(lab.folder / "data/r", {recording.name: (recording.tables, recording.attributes)})
+    text = show_recording.to_text(show_recording.overview(lab.folder / "data/r", recording.name))
 
     assert "contact: contact 0 1.000 to 3.000 s" in text and "slip: 2.500 to 3.000 s" in text
     assert "2.000 s  xela1: cut, 1 frames, 7 bytes" in text

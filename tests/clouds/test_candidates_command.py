@@ -23,6 +23,7 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.tasks.touch.model import grasp_values
 from tests.clouds import shapes
 from tests.conftest import Lab
+from tests.fake_recordings import write_dataset
 
 
 class Model:
@@ -109,11 +110,12 @@ def test_files_are_written_whole_and_a_picture_is_drawn(lab: Lab, bottle: Cloud,
     assert sorted(path.name for path in Path("new").iterdir()) == sorted(["grasps.csv", f"grasps.{suffix}"])
 
 
-def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    complete = SimpleNamespace(streams=("cloud", "grasp"), table=lambda stream: bottle.table())
-    bare = SimpleNamespace(streams=("grasp",))
-    opened = SimpleNamespace(recordings={"bleach-1": complete, "bleach-2": bare})
-    monkeypatch.setattr("tacpipe.engine.pipeline.open_dataset", lambda path: opened)
+def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud) -> None:
+    grasp = bottle.table()
+    write_dataset(
+        Path("data/grasps"),
+        {"bleach-1": ({"cloud": bottle.table(), "grasp": grasp}, {}), "bleach-2": ({"grasp": grasp}, {})},
+    )
     printed = rows(lab.run("candidates data/grasps --recording bleach-1 --count 3").out)
     assert printed == rows(lab.run("candidates bottle.ply --count 3").out)
     for words, sentence in (

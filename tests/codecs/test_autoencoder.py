@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from tacpipe.codecs import autoencoder_fit, codec, pca
-from tacpipe.codecs.autoencoder import Autoencoder
+from tacpipe.codecs.autoencoder import CHUNK, Autoencoder
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
 from tacpipe.training.loop import Schedule
@@ -97,17 +97,16 @@ def test_a_row_depends_on_the_before_it_and_not_across_a_break(tmp_path: Path) -
     assert np.allclose(second_latents[30:], fitted.encode(changed[30:], CHANNELS), atol=1e-5)
 
 
-def test_rows_that_are_not_finite_have_no_latents_and_long_ones_are_done_in_pieces(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_that_are_not_finite_have_no_latents_and_long_ones_are_done_in_pieces(tmp_path: Path) -> None:
     fitted = fit(tmp_path, frames=2)
-    values = WALKS["trial-2"].copy()
-    expected = fitted.encode(values, CHANNELS)
-    values[7, 2] = np.nan
-    monkeypatch.setattr("tacpipe.codecs.autoencoder.CHUNK", 7)
-    torn = fitted.encode(values, CHANNELS)
-    assert np.flatnonzero(np.isnan(torn).all(axis=1)).tolist() == [7, 8]
-    intact = [row for row in range(60) if row not in (7, 8)]
+    walk = WALKS["trial-2"]
+    rows = 2 * CHUNK + 10
+    values, begins = np.resize(walk, (rows, walk.shape[1])), np.arange(rows) % len(walk) == 0
+    expected = np.resize(fitted.encode(walk, CHANNELS), (rows, 4))
+    values[CHUNK - 1, 2] = np.nan
+    torn = fitted.encode(values, CHANNELS, begins)
+    assert np.flatnonzero(np.isnan(torn).all(axis=1)).tolist() == [CHUNK - 1, CHUNK]
+    intact = [row for row in range(rows) if row not in (CHUNK - 1, CHUNK)]
     assert np.allclose(torn[intact], expected[intact], atol=1e-5)
     assert fitted.encode(values[:0], CHANNELS).shape == (0, 4)
 

@@ -6,10 +6,11 @@ import pytest
 
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 
 @pytest.fixture
 def rig(lab: Lab) -> Lab:
     """A project with the dataset ``rec`` of two recordings of three streams."""
-    recordings.write(lab.folder / "rec", recordings.trials())
+    write_dataset(lab.folder / "rec", recordings.trials())
     return lab

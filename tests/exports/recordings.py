@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels import schema
-from tacpipe.datasets import directory
-from tacpipe.datasets.manifest import ACQUIRE, Manifest
-from tacpipe.io.parquet import to_parquet
-from tacpipe.store.records import RecordingEntry, Shard
-from tacpipe.store.store import Store
 
 START_NS = 1_700_000_000_123_456_789
 Tables = Mapping[str, pa.Table]
@@ -97,22 +91,6 @@ def varied(*, timeless: bool = True) -> dict[str, pa.Table]:
         cloud = {name: [0.5, 1.5] for name in ("x_m", "y_m", "z_m", "intensity")}
         streams |= {"scale": pa.table({"mass_kg": [0.5, 1.5]}), "cloud": pa.table(cloud)}
     return streams
-
-
-def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -> Path:
-    """Write recordings as a dataset of the project in the working directory; return its directory."""
-    store = Store(Path(".tacpipe").absolute())
-    store.prepare()
-    recordings: dict[str, RecordingEntry] = {}
-    for name, (tables, attributes) in given.items():
-        shards: dict[str, Shard] = {
-            stream: {**store.put(to_parquet(table)).to_json(), "rows": table.num_rows}
-            for stream, table in sorted(tables.items())
-        }
-        recordings[name] = {"attributes": dict(sorted(attributes.items())), "shards": shards}
-    output = Manifest(ACQUIRE, 1, {}, recordings=recordings)
-    directory.change(store, folder, lambda: directory.DirectoryChange(output))
-    return folder
 
 
 def trials(count: int = 2) -> dict[str, tuple[Tables, Mapping[str, Any]]]:

@@ -11,6 +11,7 @@ import pyarrow as pa
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 
 def test_what_ingest_reads_back_has_the_same_shards_and_labels(rig: Lab) -> None:
@@ -45,7 +46,7 @@ def test_labels_lie_next_to_the_streams_in_their_types(rig: Lab) -> None:
 def test_what_is_not_read_back_is_listed_on_the_output_and_in_the_readme(lab: Lab) -> None:
     cloud = pa.table({"x_m": pa.array([0.5], pa.float32())})
     gaps = recordings.skin(1).append_column("n", pa.array([None] * 40, pa.int32()))
-    recordings.write(
+    write_dataset(
         lab.folder / "rec", {"a": ({"cloud": cloud, "skin": gaps}, {}), "b": ({"skin": recordings.skin(2)}, {})}
     )
     err = lab.run("export csv rec -o csv").err

@@ -13,6 +13,7 @@ import pytest
 from tacpipe.exports.files import Files
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 EVERY = (
     "csv rec",
@@ -48,7 +49,7 @@ def test_an_export_is_answered_by_the_store_the_second_time(rig: Lab, export: st
 def test_a_new_recording_costs_one_recording_and_leaves_the_files_of_the_others(rig: Lab, export: str) -> None:
     rig.run(f"export {export} rec -o out")
     old = {path: path.stat().st_mtime_ns for path in (rig.folder / "out").rglob("*") if "trial-0" in str(path)}
-    recordings.write(rig.folder / "rec", recordings.trials(3))
+    write_dataset(rig.folder / "rec", recordings.trials(3))
     assert counts(rig.run(f"export {export} rec -o out --json").out) == (1, 2)
     assert {path: path.stat().st_mtime_ns for path in old if path.is_file()} == {
         path: at for path, at in old.items() if path.is_file()
@@ -93,7 +94,7 @@ def test_what_was_finished_before_a_failure_is_reused(rig: Lab) -> None:
 
 @pytest.mark.long
 def test_an_export_that_was_killed_resumes(lab: Lab) -> None:
-    recordings.write(lab.folder / "rec", recordings.trials(24))
+    write_dataset(lab.folder / "rec", recordings.trials(24))
     before = len(list(lab.store.records()))
     command = [sys.executable, "-m", "tacpipe", "export", "mcap", "rec", "-o", "out", "--jobs", "1"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:

@@ -15,6 +15,7 @@ import pytest
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 
 def test_h5py_reads_each_column_to_the_bit_with_unit_and_quantity(rig: Lab) -> None:
@@ -53,7 +54,7 @@ def test_robomimic_finds_demonstrations_with_observations_and_actions(rig: Lab) 
 
 def test_observations_hold_neither_clocks_nor_masks_nor_ground_truth(lab: Lab) -> None:
     truth = pa.table({"t_ns": recordings.skin(1)["t_ns"], "gt_slip": np.arange(40.0)})
-    recordings.write(lab.folder / "rec", {"a": ({"skin": recordings.skin(1), "truth": truth}, {})})
+    write_dataset(lab.folder / "rec", {"a": ({"skin": recordings.skin(1), "truth": truth}, {})})
     lab.run("export hdf5 rec -o demos --structure robomimic --rate-hz 100")
     with h5py.File("demos/demos.hdf5") as file:
         demo = file["data/demo_0"]
@@ -63,7 +64,7 @@ def test_observations_hold_neither_clocks_nor_masks_nor_ground_truth(lab: Lab) -
 
 
 def test_masks_list_the_demonstrations_of_each_role_of_the_split(lab: Lab) -> None:
-    recordings.write(lab.folder / "rec", recordings.trials(6))
+    write_dataset(lab.folder / "rec", recordings.trials(6))
     lab.run("split rec -o split --test 0.34 --val 0.25 --repeats 2")
     roles = {
         row["recording"]: row["role"] for row in pq.read_table("split/split.parquet").to_pylist() if row["fold"] == 1

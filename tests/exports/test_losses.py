@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 Names = set[tuple[str, str]]  # stream and column
 
@@ -118,7 +119,7 @@ def named(text: str, streams: dict[str, list[str]]) -> Names:
 @pytest.mark.parametrize(("export", "read"), FORMATS.items(), ids=FORMATS)
 def test_a_column_that_an_export_does_not_hold_is_named(lab: Lab, export: str, read: Callable[[Path], Names]) -> None:
     tables = recordings.varied(timeless="--rate-hz" not in export)
-    recordings.write(lab.folder / "rec", {"a": (tables, {})})
+    write_dataset(lab.folder / "rec", {"a": (tables, {})})
     err = lab.run(f"export {export} rec -o out").err
     streams = {stream: table.column_names for stream, table in tables.items()}
     missing = {(stream, column) for stream, columns in streams.items() for column in columns} - read(lab.folder / "out")
@@ -128,7 +129,7 @@ def test_a_column_that_an_export_does_not_hold_is_named(lab: Lab, export: str, r
 
 
 def test_streams_that_synchronize_left_out_are_named(lab: Lab) -> None:
-    recordings.write(lab.folder / "rec", {"a": (recordings.varied(timeless=False), {})})
+    write_dataset(lab.folder / "rec", {"a": (recordings.varied(timeless=False), {})})
     lab.run("synchronize rec -o sync")
     for export in ("zarr", "lerobot", "hdf5 --structure robomimic"):
         err = lab.run(f"export {export} sync -o {export.split()[0]}").err
@@ -139,7 +140,7 @@ def test_streams_that_synchronize_left_out_are_named(lab: Lab) -> None:
 def test_all_columns_that_not_all_recordings_have_are_named(lab: Lab) -> None:
     tables, attributes = recordings.trial(0)
     few = {"skin": tables["skin"].drop_columns(["taxel01_x", "taxel01_y", "taxel02_x", "taxel02_y"])}
-    recordings.write(lab.folder / "rec", {"a": (few, attributes), "b": ({"skin": tables["skin"]}, attributes)})
+    write_dataset(lab.folder / "rec", {"a": (few, attributes), "b": ({"skin": tables["skin"]}, attributes)})
     err = lab.run("export zarr rec -o out --rate-hz 100 --common").err
     line = next(line for line in err.splitlines() if "not all recordings" in line)
     assert line.endswith("skin_taxel01_x, skin_taxel01_y, skin_taxel02_x, skin_taxel02_y")

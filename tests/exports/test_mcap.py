@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 
 def read(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -91,7 +92,7 @@ def test_labels_and_columns_with_their_units_are_metadata(rig: Lab) -> None:
 def test_events_are_a_topic_in_the_order_of_time_and_missing_values_are_listed(lab: Lab) -> None:
     t_ns = [recordings.START_NS + 5, recordings.START_NS]
     events = pa.table({"t_ns": t_ns, "stream": ["skin", "arm"], "frames": pa.array([3, None], pa.int64())})
-    recordings.write(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {})})
+    write_dataset(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {})})
     ran = lab.run("export mcap rec -o mcap")
     result = read(lab.folder / "mcap/a.mcap")["/events"]
     assert [(at, value.stream, value.frames) for at, value in result] == [(t_ns[1], "arm", 0), (t_ns[0], "skin", 3)]
@@ -100,7 +101,7 @@ def test_events_are_a_topic_in_the_order_of_time_and_missing_values_are_listed(l
 
 def test_a_stream_without_time_is_listed_as_not_carried(lab: Lab) -> None:
     cloud = pa.table({"x_m": pa.array([0.5], pa.float32())})
-    recordings.write(lab.folder / "rec", {"a": ({"cloud": cloud, "skin": recordings.skin(1)}, {})})
+    write_dataset(lab.folder / "rec", {"a": ({"cloud": cloud, "skin": recordings.skin(1)}, {})})
     assert "stream cloud" in lab.run("export mcap rec -o mcap").err
     assert set(read(lab.folder / "mcap/a.mcap")) == {"/skin", "/skin/tactile"}
 
@@ -108,7 +109,7 @@ def test_a_stream_without_time_is_listed_as_not_carried(lab: Lab) -> None:
 def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
     points = {name: pa.array([0.5, -1.5], pa.float32()) for name in ("x_m", "y_m", "z_m")}
     colours = {name: pa.array([1, 255], pa.uint8()) for name in ("red", "green", "blue")}
-    recordings.write(
+    write_dataset(
         lab.folder / "rec", {"a": ({"scene": pa.table({**points, **colours}), "skin": recordings.skin(1)}, {})}
     )
     assert "stream scene" in lab.run("export mcap rec -o mcap").err
@@ -127,7 +128,7 @@ def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
 
 
 def test_encoded_images_are_messages_that_viewers_know_and_come_back_to_the_bit(lab: Lab) -> None:
-    recordings.write(lab.folder / "rec", {"a": ({"cam": recordings.camera(1), "skin": recordings.skin(1)}, {})})
+    write_dataset(lab.folder / "rec", {"a": ({"cam": recordings.camera(1), "skin": recordings.skin(1)}, {})})
     lab.run("export mcap rec -o mcap")
     table = recordings.camera(1)
     images = {

@@ -17,6 +17,7 @@ import pytest
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 from tests.stages.test_extract import frames_of
 from tests.video import videos
 
@@ -74,9 +75,7 @@ def test_lerobot_s_loader_decodes_the_nearest_frame_of_each_row(lab: Lab) -> Non
     for name, encoder, ending in (("a", "mpeg4", "avi"), ("b", "mjpeg", "avi")):
         path = videos.write(lab.folder / f"{name}.{ending}", encoder, 40)
         frames[name] = np.array(videos.decoded(path), int)
-    recordings.write(
-        lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in frames}
-    )
+    write_dataset(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in frames})
     lab.run("export lerobot rec -o lr --rate-hz 25 --master gel --no-originals")
     result = read("lerobot_video", "lr")
     assert result["frames"] == 80

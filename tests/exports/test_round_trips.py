@@ -11,7 +11,7 @@ from tacpipe.formats.lerobot import container
 from tacpipe.io import row_groups
 from tests.conftest import Lab
 from tests.exports import recordings
-from tests.fake_recordings import decode_few_rows_at_a_time
+from tests.fake_recordings import decode_few_rows_at_a_time, write_dataset
 
 FORMATS = pytest.mark.parametrize(
     ("export", "ingest"),
@@ -69,7 +69,7 @@ def test_events_come_back(lab: Lab) -> None:
     columns = {"stream": pa.array(["skin"]), "cause": pa.array(["link"]), "frames": pa.array([3])}
     fields = [schema.time_field(), *(pa.field(name, column.type) for name, column in columns.items())]
     events = pa.table([pa.array([recordings.START_NS]), *columns.values()], pa.schema(fields))
-    recordings.write(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {"object": "cup"})})
+    write_dataset(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {"object": "cup"})})
     for export, ingest in (("mcap rec", "mcap"), ("hdf5 rec", "hdf5"), ("lerobot rec --rate-hz 100", "lerobot")):
         lab.run(f"export {export} -o out-{ingest}")
         lab.run(f"ingest {ingest} out-{ingest} -o back-{ingest}")

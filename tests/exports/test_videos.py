@@ -17,8 +17,8 @@ from tacpipe.arrays import Bytes
 from tacpipe.video.decoding import padded_packet
 from tacpipe.video.stream import read_format
 from tests.conftest import Lab
-from tests.exports import recordings
 from tests.exports.test_mcap import read
+from tests.fake_recordings import write_dataset
 from tests.stages.test_extract import frames_of
 from tests.video import videos
 
@@ -35,7 +35,7 @@ def write(lab: Lab, encoder: str, ending: str, monkeypatch: pytest.MonkeyPatch, 
     }
     monkeypatch.setattr(videos, "OPTIONS", parameters)
     path = videos.write(lab.folder / f"gel.{ending}", encoder, COUNT)
-    recordings.write(lab.folder / "rec", {"a": ({"gel": frames_of(path)}, {})})
+    write_dataset(lab.folder / "rec", {"a": ({"gel": frames_of(path)}, {})})
     return path
 
 
@@ -192,6 +192,6 @@ def test_zarr_arrays_have_the_nearest_frame_of_each_row(
 def test_cameras_with_different_codec_headers_are_exported_together(lab: Lab) -> None:
     videos.write(lab.folder / "a.avi", "mpeg4", COUNT)
     videos.write(lab.folder / "b.avi", "mjpeg", COUNT)
-    recordings.write(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in "ab"})
+    write_dataset(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in "ab"})
     lab.run(f"{LEROBOT} --no-originals")
     assert len(list(Path("lr/videos").rglob("*.mp4"))) == 2

@@ -12,6 +12,7 @@ import zarr
 import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import write_dataset
 
 
 def opened() -> Any:
@@ -43,7 +44,7 @@ def test_the_store_holds_nothing_that_zarr_does_not_know(rig: Lab) -> None:
 def test_recordings_of_other_channels_are_refused_by_name(lab: Lab) -> None:
     both = {"skin": recordings.skin(1), "arm": recordings.arm(1)}
     provided: dict[str, Any] = {"a": ({"skin": recordings.skin(1)}, {}), "b": (both, {})}
-    recordings.write(lab.folder / "rec", provided)
+    write_dataset(lab.folder / "rec", provided)
     ran = lab.call("export zarr rec -o buffer --rate-hz 100")
     assert ran.code == 2
     assert "b" in ran.err.split()
@@ -59,7 +60,7 @@ def test_integers_of_which_one_recording_misses_some_are_floats_in_all(lab: Lab)
         "a": ({"skin": whole.append_column(counts, pa.array(range(40), pa.int32()))}, {}),
         "b": ({"skin": gaps.append_column(counts, pa.array([None] * 20 + list(range(20)), pa.int32()))}, {}),
     }
-    recordings.write(lab.folder / "rec", provided)
+    write_dataset(lab.folder / "rec", provided)
     lab.run("synchronize rec -o sync --rate-hz 100 --values hold")
     lab.run("export zarr sync -o buffer")
     tables = [recording.table() for recording in tacpipe.open("sync")]

@@ -101,11 +101,13 @@ def test_every_kernel_sums_one_to_nine_channels_and_small_sums_are_the_most_freq
     assert rocket.channels.any(axis=(0, 1)).all()
 
 
-def test_slides_are_transformed_alike_alone_and_among_others(fitted: Rocket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slides_are_transformed_alike_alone_and_among_others(fitted: Rocket) -> None:
     x = slides(40)
-    batched = fitted.transform(x)
-    monkeypatch.setattr(minirocket, "BLOCK_BYTES", 1)  # blocks of sixteen
-    assert np.array_equal(fitted.transform(x), batched)
+    count = minirocket.BLOCK_BYTES // x[0, :, :1].nbytes  # slides of a block
+    many = np.resize(x, (2 * count + 3, *x.shape[1:]))
+    batched, alone = fitted.transform(many), fitted.transform(x)
+    assert np.array_equal(alone, batched[:40])
+    assert np.array_equal(np.resize(alone, batched.shape), batched)
     assert np.array_equal(fitted.transform(x[7:8]), batched[7:8])
 
 

@@ -20,7 +20,7 @@ from tacpipe.clouds import files as cloud_files
 from tacpipe.clouds import point_files
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.formats import csv_table
-from tacpipe.io import memory, parquet_claims
+from tacpipe.io import parquet_claims
 from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.conftest import Lab, without_created_store
 from tests.promises import targets
@@ -93,7 +93,7 @@ def test_a_negative_number_of_rows_is_refused(rows: int) -> None:
 
 @pytest.mark.parametrize("size", [10**9, (1 << 31) - 1])
 def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
-    size: int, monkeypatch: pytest.MonkeyPatch
+    size: int, leave_memory: Callable[[int], None]
 ) -> None:
     content = to_parquet(pa.table({"t_ns": np.arange(5)}))
     header = parquet_claims._USUAL.match(content, 4)
@@ -103,7 +103,7 @@ def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
     column_size = b"\x16" + varint(_size(content))  # the column's size in the file
     assert column_size in footer_of(content)
     bomb = with_footer(bomb, footer_of(content).replace(column_size, b"\x16" + varint(_size(content) + shift)))
-    monkeypatch.setattr(memory, "available", lambda: 10**8)
+    leave_memory(10**8)
     check_refusal(lambda: from_parquet(bomb), "declares", ShortageError)
 
 

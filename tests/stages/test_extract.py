@@ -16,7 +16,7 @@ from tacpipe.channels.places import taxel_positions
 from tacpipe.channels.streams import columns_with_quantity
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.registry import load
-from tests.conftest import Lab
+from tests.conftest import Lab, forget, write_plugin
 from tests.fake_recordings import FakeRecording
 from tests.formats import video_files
 from tests.stage_params import build_params
@@ -189,22 +189,30 @@ def test_features_follow_from_the_frames_and_the_digest_of_the_weights(lab: Lab)
     assert not tacpipe.open("encoded")["trial-000"].table("gel1").equals(features)
 
 
+CORNER_ENCODER = """
+def load(path):
+    return lambda images: images.reshape(len(images), -1)[:, :3].astype("float32") + len(images)
+"""
+
+
 def test_an_encoder_gives_a_frame_the_same_features_whatever_follows_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(path: Path) -> Any:
-        return lambda images: images.reshape(len(images), -1)[:, :3].astype(np.float32) + len(images)
-
-    monkeypatch.setattr("tacpipe.plugins.registry.load_encoder", lambda name: load)
+    write_plugin(
+        tmp_path, "corner", "[tacpipe.encoders]\ncorner = corner_encoder:load\n", corner_encoder=CORNER_ENCODER
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    forget()
     weights = tmp_path / "weights"
     weights.write_bytes(b"any")
     frames = frames_of(videos.write(tmp_path / "gel.avi", "mjpeg", 40))
-    features = extract({"gel": frames}, "extract.encoder", weights=str(weights))["gel"]
+    features = extract({"gel": frames}, "extract.encoder", weights=str(weights), encoder="corner")["gel"]
     images = videos.decoded(tmp_path / "gel.avi")
     expected = np.array([image.reshape(-1)[:3] for image in images], np.float32) + 32
     assert np.array_equal(np.column_stack([features.column(f"feature{n:02d}").to_numpy() for n in (1, 2, 3)]), expected)
-    part = extract({"gel": frames.slice(0, 33)}, "extract.encoder", weights=str(weights))["gel"]
+    part = extract({"gel": frames.slice(0, 33)}, "extract.encoder", weights=str(weights), encoder="corner")["gel"]
     assert part.equals(features.slice(0, 33))
+    forget()
 
 
 def test_weights_that_are_missing_or_changed_are_refused(tmp_path: Path) -> None:
