@@ -23,8 +23,10 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.datasets.dataset import Model, Recording
     from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
 
+STEPS = (1, 3, 5, 10)  # steps ahead of the forecasts
 SMALLEST_LOAD = 1e-3  # smallest divisor, as a fraction of the largest load of a recording
 
 
@@ -69,11 +71,24 @@ class RuleScorer:
     runs_live: bool = False  # the forecasts come from another model
 
     @cached_property
-    def _forward_model(self) -> Any:
+    def _forward_model(self) -> Model:
         """The model, opened once for all tracks."""
         import tacpipe
 
-        return tacpipe.load(Path(self.path))
+        return tacpipe.open(Path(self.path))
+
+    def forecasts(self, recording: Recording) -> pa.Table:
+        """Return the forecasts of a recording, with the metadata of their columns, which `ForwardModel.predict` lacks."""
+        from tacpipe.datasets import model_files
+        from tacpipe.tasks.recordings import OpenedChain, open_for_model
+        from tacpipe.tasks.task import PredictionRequest
+
+        model = self._forward_model
+        opened = open_for_model(recording, OpenedChain(model))
+        result = model_files.task(model.files, self.path).predict(model, opened, PredictionRequest(STEPS))
+        (output,) = result.recordings.values()
+        rows = output.streams[""]
+        return rows if hasattr(rows, "num_rows") else rows.read_all()
 
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
         """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one.
@@ -82,7 +97,7 @@ class RuleScorer:
         """
         if track.recording is None:
             raise TacpipeError("The rule needs the recordings of a dataset. Give a dataset instead of a table.")
-        table = self._forward_model.predict(track.recording)
+        table = self.forecasts(track.recording)
         scores = np.append(score_forecasts(table), 0.0)
         times = table["t_ns"].to_numpy()
         return scores[np.searchsorted(times, track.t_ns[rows], side="right") - 1]

@@ -11,12 +11,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+import tacpipe
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.slip import evaluation, training
 from tacpipe.tasks.slip.model import SlipModel, calibrate, predict
 from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule
-from tacpipe.tasks.slip.rule import score_forecasts
+from tacpipe.tasks.slip.rule import RuleScorer, score_forecasts
 from tacpipe.tasks.task import CalibrationRequest
+from tests import commands
 from tests.fake_recordings import FakeRecording, dataset
 from tests.tasks.slip.slip_recordings import held_object, stored, trials
 
@@ -172,3 +174,20 @@ def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path)
         model.scorer.score_window(model.reader, [track.fingers[0].values[:1]])
         == model.table(recording)["score"][0].as_py()
     )
+
+
+def test_the_rule_reads_the_forecasts_of_a_forward_model(tmp_path: Path) -> None:
+    (tmp_path / ".tacpipe").mkdir()
+    lines = [
+        "simulate forward --trials 5 --duration-s 4 --effort 1.2 --robot-rate-hz 50 --seed 3 -o raw",
+        "synchronize raw --streams xela* --rate-hz 20 -o even",
+        "segment contacts even -o segments",
+        "split segments -o split --scheme random --val 0.4 --test 0",
+        "train forward segments --split split --actions none --epochs 1 -o forward",
+    ]
+    commands.run(tmp_path, lines)
+    table = RuleScorer(str(tmp_path / "forward"), "").forecasts(tacpipe.open(tmp_path / "segments")["trial-000"])
+    for place, name in enumerate(table.column_names):
+        if name.startswith("xela1") and name.endswith("_x_t5"):  # the shear rises five steps ahead and falls later
+            table = table.set_column(place, table.schema.field(place), pa.array(table[name].to_numpy() + 1000))
+    assert (score_forecasts(table) > 0.1).all()
