@@ -1,7 +1,5 @@
 """Tables of every type that a stage, a format or a sensor writes, with the values that are the hardest to keep."""
 
-from __future__ import annotations
-
 import string
 from typing import Any
 

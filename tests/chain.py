@@ -1,7 +1,5 @@
 """The forward chain on a few simulated trials, as a lab would type it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests import commands

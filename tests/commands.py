@@ -1,7 +1,5 @@
 """Run several tacpipe commands in one new process, which imports everything only once."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A lab for tests: a project folder with its own store, the command line at hand, and a third party's plug-in."""
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import json

@@ -1,7 +1,5 @@
 """Build recordings and datasets for tests, without a store for functions that read them, and published in one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Digests of the values of each deterministic stage on simulated recordings: `python -m tests.golden_values`."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

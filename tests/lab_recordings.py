@@ -4,8 +4,6 @@ The load follows from how deep the arm presses, so that a planned motion states 
 period of their texture alone, so that how hard was pressed states nothing.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

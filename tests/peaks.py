@@ -1,7 +1,5 @@
 """Measure the peak resident memory of a command in a separate process."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

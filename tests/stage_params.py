@@ -1,7 +1,5 @@
 """A stage's params as a command would build them, for tests that call stages and tasks without one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

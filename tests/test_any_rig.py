@@ -1,7 +1,5 @@
 """A lab's folder of recordings, from a guessed layout to the reports of both tasks, by commands alone."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

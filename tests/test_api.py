@@ -1,7 +1,5 @@
 """The public Python API: what it returns, what it refuses, and what importing it costs."""
 
-from __future__ import annotations
-
 import html
 import inspect
 import json

@@ -1,7 +1,5 @@
 """Architectures of other packages: choices like built-in ones, their version in keys, and why one does not fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

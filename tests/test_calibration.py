@@ -1,7 +1,5 @@
 """Temperature, reliability and areas under curves: scikit-learn and worked values as oracles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Channels found by quantity, unit and component, whatever their columns are called."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How often intervals hold the truth in simulations, and the page that states it."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path

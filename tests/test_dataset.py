@@ -1,7 +1,5 @@
 """A dataset gives back to the bit what was put into it, and its files give it to other programs."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Iterator, Mapping

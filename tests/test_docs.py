@@ -1,7 +1,5 @@
 """Texts and help are true: commands run as printed, paths exist, examples parse."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import io

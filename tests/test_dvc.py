@@ -1,7 +1,5 @@
 """Chains under real DVC: it tracks manifests alone, and tacpipe reads what these name."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """Every param of every stage says what it may be, and what it may not be is refused before anything is read."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

@@ -1,7 +1,5 @@
 """The packages that the pages of docs/extending print are installed into a fresh environment, and used there as printed."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

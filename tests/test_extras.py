@@ -1,7 +1,5 @@
 """Commands without tacpipe's extras work or end in one sentence with the extra and how to install it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

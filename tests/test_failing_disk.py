@@ -1,7 +1,5 @@
 """A disk that fails to read, or a limit of open files, is its own sentence: never called damage, nor taken for absence."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """One more recording costs the same however many there are, counted in reads and writes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A headline states the best model against the best baseline, as a sentence and as a table."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Intervals and skill, worked out one by one or by scipy. How often intervals hold the truth: `tests/test_coverage.py`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

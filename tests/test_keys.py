@@ -1,7 +1,5 @@
 """Keys: what must change one does, what must not does not, and no two identities share one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """`label` and `show` read and write only what they change or list, however many recordings there are."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 CONTRIBUTING.md has the glossary. `EXCEPTIONS` has the true exceptions, each with its reason.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import re

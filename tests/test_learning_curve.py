@@ -1,7 +1,5 @@
 """Test the pooling and the table of `make learning-curve`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

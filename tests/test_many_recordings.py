@@ -1,7 +1,5 @@
 """Compare a stage's peak of memory over 10 and 100 recordings: it does not grow with the recordings of a dataset."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests import peaks

@@ -1,7 +1,5 @@
 """Arrays that lie in mapped files hold what was put into them, and take memory only while they are read."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

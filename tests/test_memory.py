@@ -1,7 +1,5 @@
 """Too little memory is one sentence: no traceback, no abort, and never called damage or a bad recording."""
 
-from __future__ import annotations
-
 import errno
 import resource
 import subprocess

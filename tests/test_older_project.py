@@ -1,7 +1,5 @@
 """A project as an older version wrote it: its store, datasets, model and labels are read, and its keys still hit."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`tacpipe show` and `tacpipe evaluate` print models, results, splits and recordings."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """Datasets whose manifest lists pages: they hold what a manifest that holds the recordings itself does."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """A note that all files of a dataset are there: while it holds none is looked at, and no fault of a name goes unseen."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

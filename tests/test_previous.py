@@ -1,7 +1,5 @@
 """A run over a dataset in which few recordings changed reuses the previous run, with the bytes of a first run."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

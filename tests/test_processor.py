@@ -1,7 +1,5 @@
 """A record states the processor and the threads that computed it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page of evidence names the tests of each guarantee, and the pages on guarantees name every file of tests/promises."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The Python of docs/python.md runs as printed, in the project that the first commands of the README make."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Errors and skill of predicted values against scikit-learn, numbers worked out by hand, and what the letter printed."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

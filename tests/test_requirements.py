@@ -1,7 +1,5 @@
 """`train TASK --requirements` prints what the task needs: recordings without it are refused, others are read."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`tacpipe run`: a chain gives what its commands give one by one, and does again only what has something to do."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

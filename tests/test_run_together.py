@@ -1,7 +1,5 @@
 """`tacpipe run --jobs`: several stages at a time give what they give one after another."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

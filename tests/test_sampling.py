@@ -1,7 +1,5 @@
 """Parts of the slow and of the exhaustive tests: each commit runs another one, and together they are all tests."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

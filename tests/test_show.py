@@ -1,7 +1,5 @@
 """`tacpipe show` and `tacpipe explain` summarize what has many files, and `store link` removes leftovers of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

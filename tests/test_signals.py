@@ -1,7 +1,5 @@
 """A signal that ends a process of these tests is named, with the test that it met."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

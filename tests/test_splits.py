@@ -1,7 +1,5 @@
 """Roles of recordings under each scheme."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

@@ -1,7 +1,5 @@
 """No control character of a file's content is printed, and no standard stream makes a command fail."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

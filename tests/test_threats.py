@@ -1,7 +1,5 @@
 """Statements of docs/explanation/threats.md that no other test tries."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

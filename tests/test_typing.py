@@ -1,7 +1,5 @@
 """Stages under type checkers: those that the texts print pass as printed, and a call with wrong arguments does not."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Walls between parts of the engine that no import contract sees."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 `hide` fills a folder; with it first in ``PYTHONPATH`` every Python process, workers among them, finds no other module.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions

@@ -1,7 +1,5 @@
 """Ray-traced camera views of a tilted table with a grasped ball and a box."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clouds of points on bodies whose grasps are known by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tacpipe.arrays import Floats

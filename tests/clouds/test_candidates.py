@@ -1,7 +1,5 @@
 """Test candidates on bodies with known antipodal pairs, and against published grasps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

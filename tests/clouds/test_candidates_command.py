@@ -1,7 +1,5 @@
 """The command ``tacpipe candidates``."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

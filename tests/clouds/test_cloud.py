@@ -1,7 +1,5 @@
 """Test that invalid clouds are rejected, and that tables restore clouds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Files of clouds that open3d wrote, whole and damaged."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Features of a grasp: those of a box by hand, and what must not change them."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

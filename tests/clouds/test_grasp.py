@@ -1,7 +1,5 @@
 """Test that invalid grasps are rejected, tables restore grasps, and swapping and moving obey their laws."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest

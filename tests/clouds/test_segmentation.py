@@ -1,7 +1,5 @@
 """Objects found in views that are known point by point."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

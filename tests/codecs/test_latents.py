@@ -1,7 +1,5 @@
 """Latents of a long recording are added in pieces, to the values of the whole."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest

@@ -1,7 +1,5 @@
 """Compare the moments of chunks of rows with those that numpy computes from all rows."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Handmade runs, for which all results of a comparison can be computed independently."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Check the output of ``tacpipe compare``: one row per method or run, columns for what differs, the best first."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

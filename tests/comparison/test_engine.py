@@ -1,7 +1,5 @@
 """Methods next to their baselines, held to numpy and scipy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A Dask scheduler and workers in separate processes, because threads of this process would disturb other tests."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Slurm on one computer, with its own key and folders, from Debian's package slurm-wlm, started for tests."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

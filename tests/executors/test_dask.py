@@ -1,7 +1,5 @@
 """Test Dask workers: connection, required versions, and recovery after a worker dies."""
 
-from __future__ import annotations
-
 import signal
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Test that workers, scheduler and command may end at any moment, and that the same command then completes the result."""
 
-from __future__ import annotations
-
 import os
 import random
 import shlex

@@ -1,7 +1,5 @@
 """Test that every executor gives the same datasets, errors and exit codes."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A training in a worker, as the command's trackers and its terminal see it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test that one command for several folds gives the results of single folds, each in its own folder."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test Slurm jobs: their submission, the error of a job that cannot work, and that no job is left behind."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

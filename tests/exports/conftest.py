@@ -1,7 +1,5 @@
 """A project with two recordings."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.conftest import Lab

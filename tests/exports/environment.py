@@ -6,8 +6,6 @@ would be 8 GB. torchvision, of which its loader uses one class for pictures, is 
 videos, with the shared libraries of Debian's ffmpeg; its later releases need CUDA.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import sysconfig

@@ -3,8 +3,6 @@
 This module does not import tacpipe.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

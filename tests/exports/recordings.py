@@ -1,7 +1,5 @@
 """Recordings made by hand with every type of column, and the same ones synchronized, written as a dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

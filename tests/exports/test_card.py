@@ -1,7 +1,5 @@
 """Dataset cards: DuckDB and polars read the rows; `datasets` and `mlcroissant` read them in `test_other_tools`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Messages packed by numpy have the bytes that the serializer of rosbags gives."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

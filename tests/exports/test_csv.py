@@ -1,7 +1,5 @@
 """Test that `ingest table` restores exported CSV files bit for bit."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

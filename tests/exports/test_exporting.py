@@ -1,7 +1,5 @@
 """Exports are keyed and incremental like any stage, and their files are the user's to write in."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

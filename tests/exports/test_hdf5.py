@@ -1,7 +1,5 @@
 """HDF5 files as h5py reads them: values to the bit, units, labels, and robomimic's structure."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

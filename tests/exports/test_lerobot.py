@@ -1,7 +1,5 @@
 """LeRobot datasets as pyarrow and json read them; LeRobot's own loader reads them in `tests.exports.test_other_tools`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

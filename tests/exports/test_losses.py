@@ -1,7 +1,5 @@
 """Each column of a recording is in its export, or the command and the README name it as not carried."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """MCAP files as rosbags and mcap's own reader read them: names, types, values to the bit, stamps, labels."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 They need a separate environment: `make test-exports` creates it and runs these tests.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Export each published set in each format that supports it, and read it back with other tools."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import duckdb

@@ -1,7 +1,5 @@
 """What was exported and ingested again has the same shards, by digest, and the same labels."""
 
-from __future__ import annotations
-
 import pyarrow as pa
 import pytest
 

@@ -1,7 +1,5 @@
 """Test that exported videos decode to the recorded frames, and that packets are restored bit for bit."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

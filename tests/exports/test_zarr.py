@@ -1,7 +1,5 @@
 """Zarr replay buffers as zarr reads them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

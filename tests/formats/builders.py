@@ -1,7 +1,5 @@
 """Parts that tests of several formats share."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

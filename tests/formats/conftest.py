@@ -1,7 +1,5 @@
 """Trials in the layouts of the published sets, where a test wants them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A container format for tests: a JSON file of streams."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

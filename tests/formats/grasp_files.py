@@ -1,7 +1,5 @@
 """Grasps in the layout of vision2tactile, small and made up."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

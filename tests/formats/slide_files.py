@@ -1,7 +1,5 @@
 """Slides in the layouts of the published sets, small and made up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """BioTac slides: made-up ones with each fault of the files, and the published ones where they are at hand."""
 
-from __future__ import annotations
-
 import os
 from decimal import Decimal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts that all formats of containers share, tried with a fake container."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Test the results and the errors of the strict CSV reader."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

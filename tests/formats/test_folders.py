@@ -1,7 +1,5 @@
 """Trials as folders: their names as recordings', collisions of them, and folders that cannot be listed."""
 
-from __future__ import annotations
-
 import ast
 import errno
 import io

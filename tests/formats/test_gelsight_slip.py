@@ -1,7 +1,5 @@
 """Published trials of two GelSight Mini become recordings of two streams of frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

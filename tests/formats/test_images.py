@@ -1,7 +1,5 @@
 """Images in HDF5, Zarr and NPZ files, LeRobot datasets and bags become streams of frames that decode to the same images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

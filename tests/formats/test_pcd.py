@@ -1,7 +1,5 @@
 """Test that PCD files of open3d are read, that open3d reads ours, and that invalid files are rejected."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

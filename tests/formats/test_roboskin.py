@@ -1,7 +1,5 @@
 """RoboSkin slides: made-up blocks in every arrangement, and the published ones where they are at hand."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

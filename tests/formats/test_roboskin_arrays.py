@@ -1,7 +1,5 @@
 """The time axis of an array: against numpy's correlation, and on arrays that are made to have one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Grasps as vision2tactile has them: made up, and the published ones where they are at hand."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test that handmade XDF files are read according to the specification, up to damage."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import logging

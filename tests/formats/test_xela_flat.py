@@ -1,7 +1,5 @@
 """The flat object set: made-up trials with each of its faults, and the published ones where they are at hand."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The slip control set: made-up trials with each of its faults, and the published ones where they are at hand."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write trials as the published GelSight set has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """XDF files written from the specification of the format, chunk by chunk."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field

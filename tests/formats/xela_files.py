@@ -1,7 +1,5 @@
 """Trials in the layouts of the published sets of uSkin sensors, small and made up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gains and intervals against those worked out another way."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

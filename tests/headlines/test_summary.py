@@ -1,7 +1,5 @@
 """The few numbers of ``summary.json``."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

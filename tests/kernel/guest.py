@@ -4,8 +4,6 @@ Prints one line, ``RESULT`` and JSON. Run as ``guest.py board`` it is the device
 `tests/links/hid_board.py` does. Run as ``guest.py camera`` it reads the kernel's ``vivid`` camera.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

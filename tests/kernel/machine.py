@@ -1,7 +1,5 @@
 """A virtual machine with Debian's stock kernel, whose root is this computer's, read-only: nothing is installed in it."""
 
-from __future__ import annotations
-
 import gzip
 import lzma
 import re

@@ -3,8 +3,6 @@
 `make test-kernel` runs this; it takes about three minutes and fetches the kernel once, so `make test` leaves it out.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

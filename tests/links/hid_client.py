@@ -3,8 +3,6 @@
 Arguments: how many reports to wait for, and then whether to wait for the device to go away. No test by itself.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

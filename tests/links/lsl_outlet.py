@@ -3,8 +3,6 @@
 Usage: python lsl_outlet.py KIND NAME FIRST
 """
 
-from __future__ import annotations
-
 import select
 import sys
 import time

@@ -1,7 +1,5 @@
 """The reference board on raw HID, byte by byte: what devices that are played by tests send and say of themselves."""
 
-from __future__ import annotations
-
 # usage page FFAB, usage 0200, a collection with 64 bytes in and 64 bytes out, as Teensy's RawHID has it
 DESCRIPTOR = bytes.fromhex("06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0")
 

@@ -1,7 +1,5 @@
 """Test that a depth camera returns one image per entry, and that a missing one raises an error."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Test that a dialogue is executed, and that data that arrive meanwhile are not lost."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

@@ -1,7 +1,5 @@
 """Test that a watched folder returns each file once, when it is complete."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path

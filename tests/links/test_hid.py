@@ -1,7 +1,5 @@
 """HID: the unmodified hidapi against a device that umockdev plays, and the choice among devices and interfaces."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

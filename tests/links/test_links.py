@@ -1,7 +1,5 @@
 """The same questions for all kinds of links, each against a real other end."""
 
-from __future__ import annotations
-
 import contextlib
 import termios
 import threading

@@ -1,7 +1,5 @@
 """Test that samples, timestamps and description of an LSL stream of another process arrive."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Test that images by HTTP are independent of how bytes are divided, and that invalid streams are rejected."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import threading

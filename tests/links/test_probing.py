@@ -1,7 +1,5 @@
 """Test that a port is probed first by listening at likely rates, and then by the requests of drivers."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

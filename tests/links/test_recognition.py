@@ -1,7 +1,5 @@
 """Bytes are traced to the sensor that speaks, by frames and rate, and noise to none."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

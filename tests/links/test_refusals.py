@@ -1,7 +1,5 @@
 """Test that a link that cannot be opened raises one sentence with the device, the fault and a remedy."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

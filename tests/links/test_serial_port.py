@@ -1,7 +1,5 @@
 """Test that serial ports are opened exclusively, with the sensor's settings, and that errors explain failures."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pty

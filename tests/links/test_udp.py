@@ -1,7 +1,5 @@
 """Properties that only UDP has: the kernel's stamp of each datagram and the number of those it dropped."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import socket

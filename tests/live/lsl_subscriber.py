@@ -1,7 +1,5 @@
 """Publish messages by LSL in this process, read them with pylsl's own inlet, and print them as JSON."""
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Any

@@ -4,8 +4,6 @@ Run in the place of ``tacpipe``, it has the model's process predict so as well; 
 process be slow (``slow:SECONDS`` a grid point) or end by itself (``die:FORECASTS``).
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import os

@@ -1,7 +1,5 @@
 """The recording of a small rig with two sensors and an arm, and models with preprocessing stages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

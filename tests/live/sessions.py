@@ -1,7 +1,5 @@
 """Live sessions in separate processes, with the messages of subscribers and the recordings."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

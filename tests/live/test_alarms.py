@@ -1,7 +1,5 @@
 """Alarms: their levels keep to the false alarms that were allowed, and without a forecast they are unknown."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Samples become forecasts: the same however they are cut, and the same as the stages of a whole recording."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Test that the client on the page about live sessions works as described."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

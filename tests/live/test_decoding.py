@@ -1,7 +1,5 @@
 """Test which chunks of a live stream are decoded before a due row, and which can wait."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

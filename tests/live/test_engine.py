@@ -1,7 +1,5 @@
 """The logic of a live session, over bytes that a test wrote and a clock that it turns."""
 
-from __future__ import annotations
-
 import functools
 import json
 

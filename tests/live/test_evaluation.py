@@ -1,7 +1,5 @@
 """Test `tacpipe evaluate --live`, which compares a session's messages with the offline chain on the same recording."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Channels of a live camera equal those that `tacpipe extract` computes of the recording."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

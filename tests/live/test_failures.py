@@ -3,8 +3,6 @@
 Nothing here goes by the clock: a forecast is held against the arrival of what it was made from, in the recording.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Messages published by LSL reach pylsl's own inlet, described channel by channel."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Test that live materials are those of the samples so far, and finally those of `tacpipe predict`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A live session of a model of materials, on an emulated BioTac that slides: what is published is recorded and predicted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

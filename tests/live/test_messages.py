@@ -1,7 +1,5 @@
 """Test that published messages contain the predictions, in every format."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

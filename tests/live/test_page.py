@@ -1,7 +1,5 @@
 """The page that the publisher serves at its own address, as a browser shows it."""
 
-from __future__ import annotations
-
 import urllib.error
 import urllib.request
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Plans reach a session by UDP, by websocket and from the arm's own set-points; where they end, that is the cause."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """Subscribers get each message as it was published, and one that is slow costs nobody else anything."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

@@ -1,7 +1,5 @@
 """Test that `tacpipe predict --causal` reproduces the messages of a live session and reads no later sample."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test live sessions with real processes and emulated devices: failures cost forecasts, never samples."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

@@ -1,7 +1,5 @@
 """Settings of a live session come from the rig file and, over it, from the command; errors name the place."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

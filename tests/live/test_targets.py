@@ -1,7 +1,5 @@
 """The set-point of an arm's controller is read from the arm's own stream, and taken to go on as it did."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

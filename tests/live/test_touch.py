@@ -1,7 +1,5 @@
 """Test that candidate grasps are ranked by the predictions of `tacpipe predict` and a criterion."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test a live session of a touch model: requests and rankings by UDP, both recorded."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Bytes of the links reach the model's process in order, or are thrown away and counted; nobody waits for it."""
 
-from __future__ import annotations
-
 import os
 import socket
 from collections.abc import Iterator

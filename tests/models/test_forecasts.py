@@ -1,7 +1,5 @@
 """Test that all forecasters start at persistence, do not look ahead, and reject what they cannot read."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Forests against scikit-learn's, whose cuts they keep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from safetensors.torch import load, save

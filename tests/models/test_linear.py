@@ -1,7 +1,5 @@
 """The linear baselines, against plain loops, scikit-learn and processes whose future is known."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MiniRocket, against loops written from the paper: kernels, padding, dilations, biases and shares."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

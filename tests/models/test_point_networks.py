@@ -1,7 +1,5 @@
 """PointNet against a plain one of torch's convolutions, and against its size by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings

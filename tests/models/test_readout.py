@@ -1,7 +1,5 @@
 """Linear readouts, against scikit-learn and against leaving slides out for real."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

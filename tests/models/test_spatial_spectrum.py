@@ -1,7 +1,5 @@
 """Test that spectra over spatial frequency depend on the surface, not on the sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Test that torch and numpy use one thread in a block, and the previous number afterwards."""
 
-from __future__ import annotations
-
 import torch
 from threadpoolctl import ThreadpoolController
 

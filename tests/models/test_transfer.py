@@ -1,7 +1,5 @@
 """Compare classes shared between sensors with normal distributions and the rule of Bayes by another road."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal

@@ -1,7 +1,5 @@
 """Check the arm inputs of a forecaster: the same wherever the base stands, and without later information."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation

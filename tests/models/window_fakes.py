@@ -1,7 +1,5 @@
 """Windows of random touch and of a hand that moves smoothly, for the tests of models."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Two clients of one export of a kernel's NFS server, in User-mode Linux: `TACPIPE_TEST_NFS=1 pytest tests/nfs`, minutes."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

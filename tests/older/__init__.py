@@ -1,7 +1,5 @@
 """A project as an older version of tacpipe left it."""
 
-from __future__ import annotations
-
 import tarfile
 from pathlib import Path
 

@@ -6,8 +6,6 @@ builds both below ``--place``, and makes an environment of each extra from the w
 In each it imports every module, runs commands, and prints how much the environment weighs. Ends with 1 if one fails.
 """
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """The wheel contains every package of the sources, and `make test-install` tries each of the extras."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

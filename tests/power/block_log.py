@@ -4,8 +4,6 @@ The layout is that of Linux' `drivers/md/dm-log-writes.c`: a superblock, then fo
 data behind it.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Each answer is a line, ``RESULT`` and JSON.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl

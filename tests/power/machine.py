@@ -1,7 +1,5 @@
 """User-mode Linux: a kernel that is a program, whose root is this computer's, read-only, and whose disks are files."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Replay power failures on real file systems block by block: `make test-power` runs this, which takes minutes."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

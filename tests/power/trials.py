@@ -5,8 +5,6 @@
 prints how many states were tried, and what was wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """A sound project that took some seconds to make, and copies of it to be harmed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -3,8 +3,6 @@
 python -m tests.promises.counts COUNTS [--write docs/benchmarks/faults.md]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """Damage files as disks, people and other programs do."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

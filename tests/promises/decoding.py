@@ -1,7 +1,5 @@
 """Frame and decode the bytes of a link as a recording does, however they are divided into chunks."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

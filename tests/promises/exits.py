@@ -6,8 +6,6 @@ prints a table of exit codes by command and ends with 1 if one differs from 0. T
 interpreter ends, so the fault depends on time: it cannot be tried once, only counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Limit memory and duration of tests, so that an excessive test fails instead of blocking the computer."""
 
-from __future__ import annotations
-
 import contextlib
 import resource
 import signal

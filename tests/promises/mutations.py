@@ -1,7 +1,5 @@
 """Mutate valid input: bits flip, pieces are lost, and numbers are such as no program would write."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from random import Random

@@ -4,8 +4,6 @@ The calls of ``os``, ``fcntl`` and ``open`` are replaced while the block of a `S
 alone. What compiled code opens by itself (safetensors, a mapped file) is not seen.
 """
 
-from __future__ import annotations
-
 import builtins
 import errno
 import fcntl

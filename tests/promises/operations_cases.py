@@ -1,7 +1,5 @@
 """Every stage and every command that uses a store, with data so small that a run takes milliseconds."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Replay stages with known results, after the same reads and checkpoints, so that trials cost only file operations."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import io

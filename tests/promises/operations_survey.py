@@ -1,7 +1,5 @@
 """Record for each call of an undisturbed run what a kill or a power failure would leave."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import dataclass

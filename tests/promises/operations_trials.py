@@ -6,8 +6,6 @@ prints a JSON line for each case: how many operations failed, and which promises
 own because it changes what ``open`` and the like are.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

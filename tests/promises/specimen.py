@@ -1,7 +1,5 @@
 """A project with all kinds of content of a store, its sound content, and methods to inspect it later."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -4,8 +4,6 @@ A function returns, or raises a `TacpipeError`; anything else is a defect. A for
 registered is here by itself, or a test says that it is missing.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -1,7 +1,5 @@
 """Test that damage to any file of a project is never served, is reported, and is repaired if possible."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Many processes on one store, of several users, on several hosts: each key is made once, and nobody is in the way."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

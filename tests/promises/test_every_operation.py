@@ -5,8 +5,6 @@ inputs are untouched, nothing is half written where somebody reads; and running 
 what a clean run gives. The same holds for a kill before each call and amid each write, and for a loss of power.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

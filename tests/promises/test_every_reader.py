@@ -3,8 +3,6 @@
 A reader answers with all recordings, with a note that names the loss, or with an error; nothing is lost without a word.
 """
 
-from __future__ import annotations
-
 import json
 import pickle
 import re

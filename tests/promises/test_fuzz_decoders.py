@@ -1,7 +1,5 @@
 """Test decoders with arbitrary bytes: they never raise, buffer little, and do not depend on the division into chunks."""
 
-from __future__ import annotations
-
 from random import Random
 
 import pytest

@@ -1,7 +1,5 @@
 """Test readers with arbitrary bytes: they return values or one sentence, without traceback, hang or excessive memory."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 

@@ -1,7 +1,5 @@
 """Test that files with false claims, with programs, or of other types are rejected before memory is allocated."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

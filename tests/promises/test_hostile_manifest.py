@@ -1,7 +1,5 @@
 """A dataset from an untrusted source: whatever its manifest names, nothing outside of it is read, changed or removed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test untrusted models and codecs: only JSON and safetensors are opened, and they are checked first."""
 
-from __future__ import annotations
-
 import functools
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Test that names and labels are text on the results page, and never run."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

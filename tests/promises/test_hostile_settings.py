@@ -1,7 +1,5 @@
 """Rig files and params from anywhere: text is text, and no name leads out of its place."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test untrusted stores: no command blocks, runs out of memory, or reads a file elsewhere."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -1,7 +1,5 @@
 """A recording that cannot be made again stays marked as such after the loss of any one file of the store."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

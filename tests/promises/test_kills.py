@@ -1,7 +1,5 @@
 """Whatever a command is killed by, and whenever: nothing keeps writing, the store is sound, a rerun equals a clean run."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

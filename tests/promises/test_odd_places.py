@@ -1,7 +1,5 @@
 """Stores that were moved, copied, thinned out or locked up, and systems that lack what others have."""
 
-from __future__ import annotations
-
 import builtins
 import ctypes
 import errno

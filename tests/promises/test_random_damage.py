@@ -1,7 +1,5 @@
 """Damage random files of a project: wrong content is never read, and everything that can be recomputed is repaired."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

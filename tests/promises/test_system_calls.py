@@ -1,7 +1,5 @@
 """Let system calls fail: a command ends with a sentence, nothing is damaged, and a rerun gives the same bytes."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Test that tacpipe withstands the faults that are also applied to DVC and joblib."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Stages that are not deterministic, and inputs that change while they are read."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

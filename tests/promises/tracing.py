@@ -4,8 +4,6 @@ Unlike `operations`, which replaces Python's functions, this reaches what compil
 and the C library.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re

@@ -4,8 +4,6 @@ Half a second of imports would be what most random kills meet. Run as ``python -
 from standard input, a line of JSON each, and answers each with a line.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Mark tests that record emulated devices in real time as a tier of their own, with limits that measure no computer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

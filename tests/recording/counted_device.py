@@ -7,8 +7,6 @@ terminal. What it sends follows from the number alone, so a reader of a recordin
 does not take yet wait in order and are never dropped. The file ``sent`` of its folder has the number of frames sent.
 """
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Build a rig with one force sensor, which sends frames of rising counts by a script."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.conftest import Lab

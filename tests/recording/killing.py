@@ -5,8 +5,6 @@
 kills as many recordings of an emulated rig at random moments and prints what that cost.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """Helpers of recording tests: a small rig that is served, commands in other processes, and each row that was sent."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -5,8 +5,6 @@ device may be silent is tried over a clock that the test turns, in `test_schedul
 computer.
 """
 
-from __future__ import annotations
-
 import importlib
 import time
 from dataclasses import replace

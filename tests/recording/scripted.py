@@ -1,7 +1,5 @@
 """Emulate a rig without threads or devices: a script lists what each stream sends, and waiting moves the clock."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import pytest

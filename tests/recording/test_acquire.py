@@ -1,7 +1,5 @@
 """Test that `tacpipe acquire` records each sample that a rig sent, with the attributes of the command line."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

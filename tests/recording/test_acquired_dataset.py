@@ -1,7 +1,5 @@
 """Test that acquired datasets are kept, carried, labelled and shown like any other, and that damage is reported."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

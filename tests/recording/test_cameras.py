@@ -1,7 +1,5 @@
 """Test that images of HTTP cameras are recorded bit for bit, whatever happens to the link or the recorder."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

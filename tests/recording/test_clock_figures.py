@@ -1,7 +1,5 @@
 """Test the clock figures of ten emulated minutes with a device clock 50 ppm off and 0.9 s lost."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -4,8 +4,6 @@ The device and what compares are of this test's own: they share no code with tac
 files with pyarrow alone.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """Test that a recording states how it ended and how long it was to last, and keeps its raw bytes on request."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Test that Ctrl-C ends and keeps a recording, and that a second one while it is sealed leaves it to `acquire --recover`."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

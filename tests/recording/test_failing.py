@@ -1,7 +1,5 @@
 """Test that a failure during a recording neither ends other streams nor loses earlier samples."""
 
-from __future__ import annotations
-
 import errno
 import os
 import time

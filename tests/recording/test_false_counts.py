@@ -1,7 +1,5 @@
 """Test recordings of datagrams with a false count and of datagrams from undeclared senders."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test that a stream's bytes become samples, and each lost frame is counted once, with its cause."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Test that the spool of a crash or a full disk is sealed later, once, and its losses are reported."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """Test dry runs, trials, triggers and time limits of recordings, with a clock that the test sets."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json

@@ -1,7 +1,5 @@
 """Test that a long recording is sealed without being in memory, and its bytes are those of its table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test the sentence about a device that is missing, held, forbidden, silent, set otherwise or another one."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

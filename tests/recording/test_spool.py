@@ -1,7 +1,5 @@
 """Test that a spool gives back what was appended, up to where a crash or a disk tore it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

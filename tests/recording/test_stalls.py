@@ -1,7 +1,5 @@
 """Test that a recorder that was stopped, starved or suspended reports it, and how uncertain the late arrivals are."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Test that a recording gets a unique name on every file system: upper and lower case count as one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Test that a sensor that a third party installed is used like the built-in ones."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.conftest import Lab

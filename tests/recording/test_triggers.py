@@ -1,7 +1,5 @@
 """Test that a key, a touch or an event of another program begins and ends a trial, with the time before it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

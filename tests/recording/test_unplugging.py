@@ -1,7 +1,5 @@
 """Test that the loss of a device is reported and counted, and that no other stream suffers."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import threading

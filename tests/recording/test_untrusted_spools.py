@@ -1,7 +1,5 @@
 """Test that a forged, unpacked or shared spool writes to no other place, and does not stop others from recording."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Test the display while a rig records: lines with rates and losses, and on a terminal a table with a taxel map."""
 
-from __future__ import annotations
-
 import http.client
 import io
 import re

@@ -1,7 +1,5 @@
 """Control headless Chromium over a pipe with the DevTools protocol, to inspect a rendered page."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

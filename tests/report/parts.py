@@ -1,7 +1,5 @@
 """Sections of a page as data: what tests read of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Charts as specifications: their numbers, colours and ends."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Frames of right and wrong predictions on the page of results."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Curves over the epochs of training."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tacpipe.report import context

@@ -1,7 +1,5 @@
 """One page for results of all tasks, whole and loading nothing."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

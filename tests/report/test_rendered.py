@@ -1,7 +1,5 @@
 """Pages as a browser shows them: the text that readers see, and whether it is whole, in a wide and a narrow window."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

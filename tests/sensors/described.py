@@ -1,7 +1,5 @@
 """Messages that a sensor writes to its device in a dialogue that the device answers."""
 
-from __future__ import annotations
-
 from tacpipe.sensors.sensor import Device, Dialogue
 from tests.sensors import talking
 

@@ -1,7 +1,5 @@
 """Apply transmission faults to frames, and state whether the protocol could detect them."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

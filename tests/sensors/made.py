@@ -1,7 +1,5 @@
 """Samples that any sensor could have taken, at random from its fields; and frames sent through a framer and back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Helpers for tests of serial drivers: bytes fed in pieces, a dialogue without a port, a pseudo-terminal with a device."""
 
-from __future__ import annotations
-
 import os
 import select
 import threading

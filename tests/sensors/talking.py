@@ -1,7 +1,5 @@
 """A host that opens a stream, and the device's side that it talks to, without a link between them."""
 
-from __future__ import annotations
-
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Sensor
 
 

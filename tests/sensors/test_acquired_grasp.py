@@ -1,7 +1,5 @@
 """Test that acquired scenes and grasps are segmented like those that were never sent."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """AnySkin frames, binary and text, are read as the package anyskin reads them."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

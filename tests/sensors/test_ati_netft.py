@@ -1,7 +1,5 @@
 """ATI Net F/T records by hand, both counters, and the requests of the manual."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

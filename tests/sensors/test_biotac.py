@@ -1,7 +1,5 @@
 """BioTac words have the published parity and bits, frames the published order, and the envelope guards both."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Check sums agree with those of the standard library, with published check values, and with the plain algorithm."""
 
-from __future__ import annotations
-
 import binascii
 import functools
 import operator

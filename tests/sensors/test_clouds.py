@@ -1,7 +1,5 @@
 """Clouds from a folder or a camera: the same points that open3d reads, and a scene that `segment grasps` can read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """PTS frames are read through their own tables, whatever these look like, and those of the last session are thrown away."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

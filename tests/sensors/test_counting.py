@@ -1,7 +1,5 @@
 """Counters that wrap, lose, restart and are interrupted are made sense of as arithmetic and the clock say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

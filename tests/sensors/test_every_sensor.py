@@ -1,7 +1,5 @@
 """Test every registered sensor: its declarations are true, and no fault creates samples."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any

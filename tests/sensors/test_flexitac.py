@@ -1,7 +1,5 @@
 """Compare FlexiTac frames with the package flexitac, also with marks within the taxels."""
 
-from __future__ import annotations
-
 import flexitac
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Frames are found again after anything that may happen to bytes, and every byte is accounted for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """States of FCI 10, laid out by hand from the published order of the fields, and the connection."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A board that only the rig file describes is read correctly, and a wrong description is reported in a sentence."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Test that scans of iCub's skin are assembled from CAN frames, and that scans are never mixed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """JustFloat frames of any board and of a fulai."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

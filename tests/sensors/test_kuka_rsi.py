@@ -1,7 +1,5 @@
 """Test RSI texts as a controller sends them, and with rsipi as server and as parser."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

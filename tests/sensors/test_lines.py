@@ -1,7 +1,5 @@
 """Lines of text as the rig file describes them: every number in its place, or no sample."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

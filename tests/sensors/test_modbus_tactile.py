@@ -1,7 +1,5 @@
 """Replies of a Modbus tactile module are read as the package tactile-pressure-sdk reads them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

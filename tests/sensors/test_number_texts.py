@@ -1,7 +1,5 @@
 """Compare numbers parsed from many texts with Python's parser; unusual texts are not parsed."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

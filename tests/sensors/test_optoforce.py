@@ -1,7 +1,5 @@
 """OptoForce frames are read as the package optoforce reads them, and its own client is served."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pushed frames of a Paxini board are read as paxini-sdk reads them, and its dialogue works amid an old stream."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reports of the reference layout are read, and what breaks the layout is no report."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Test that the pages on rigs describe the sensors correctly, and that their examples work."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -1,7 +1,5 @@
 """TSF-85 packets are read as the package pyrobotiqtactile reads them."""
 
-from __future__ import annotations
-
 import struct
 import time
 

@@ -1,7 +1,5 @@
 """Events of a SpaceMouse become rows with the whole state, however they are cut into batches."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

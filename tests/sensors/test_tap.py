@@ -1,7 +1,5 @@
 """Test the records of a program: conversion, rejection, and a grasp for `segment grasps`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """TeraRanger frames and commands carry the CRC-8 that polynomial 0x07 gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """TFmini frames and commands are those of Benewake's manuals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """RTDE packages by hand from Universal Robots' guide, and the client ur_rtde, which reads what our controller sends."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

@@ -1,7 +1,5 @@
 """WTS messages have the published sum, frames come back from run lengths, replies are separated from frames."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

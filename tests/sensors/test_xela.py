@@ -1,7 +1,5 @@
 """XELA Server texts: decoded as the vendor's node does, and nothing else is taken for one."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fit of a device's clock, on links whose clock and delays are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Load and contact intervals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Filters against scipy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

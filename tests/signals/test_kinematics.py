@@ -1,7 +1,5 @@
 """Compare kinematics with products of elementary motions and with finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

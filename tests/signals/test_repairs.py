@@ -1,7 +1,5 @@
 """Held frames and what rate is left without them."""
 
-from __future__ import annotations
-
 import statistics
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Interpolation against numpy.interp and scipy's Slerp, at stamps as large as real ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

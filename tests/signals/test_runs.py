@@ -1,7 +1,5 @@
 """Runs and states, row by row."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The limits of a slide, its retained rows, and the departures of one that is not as it should be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

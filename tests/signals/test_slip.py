@@ -1,7 +1,5 @@
 """Slip detected from a proximity sensor at 400 Hz, against the relative velocity that made its readings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Grasps of the simulated table as an in-memory dataset, as from `tacpipe simulate touch`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

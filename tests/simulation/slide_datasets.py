@@ -1,7 +1,5 @@
 """Slides of the simulated rig as a dataset: trials made, segmented, and named."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

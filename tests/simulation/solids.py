@@ -1,7 +1,5 @@
 """Independent equations of the simulated bodies, as an oracle for rays, normals and curvatures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of a log against their ground truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Test that simulated markers follow the contact forces, and that `extract markers` measures them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest

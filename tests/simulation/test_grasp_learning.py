@@ -1,7 +1,5 @@
 """Models of touch are trained on the simulated table, whose irreducible error is known."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test simulated grasps: views, finger positions, reproducibility, and controls."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from functools import cache

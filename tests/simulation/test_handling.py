@@ -1,7 +1,5 @@
 """Test that simulated handlings slip, nearly slip and release as planned, by the forces that friction can carry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

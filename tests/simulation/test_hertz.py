@@ -1,7 +1,5 @@
 """Hertz' laws: cube roots, what curvature and softness do, and the sizes that were worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

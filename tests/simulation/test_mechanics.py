@@ -1,7 +1,5 @@
 """Stick and slip against Newton and Coulomb."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

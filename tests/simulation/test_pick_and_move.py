@@ -1,7 +1,5 @@
 """Test the simulated rig against Newton's laws, and against expected counts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Forces, contacts and readings of a pinch: what follows from force, curvature, opening, and from exchanging fingers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

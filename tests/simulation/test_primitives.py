@@ -1,7 +1,5 @@
 """Bodies of the simulated table: where rays meet them, normals and curvatures, against equations and differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The proximity sensor against the slip that it sees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Compare clocks, repeats and slips estimated from the simulated rig's streams with the ground truth."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -3,8 +3,6 @@
 Forecasters are trained and evaluated on trials in which nothing slips. Ground truth is for evaluation, never for training.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from pathlib import Path

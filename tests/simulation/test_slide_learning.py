@@ -1,7 +1,5 @@
 """Learning on the simulated slides: accuracies, leaks through a session, and the effect of joint learning."""
 
-from __future__ import annotations
-
 import json
 import math
 import tempfile

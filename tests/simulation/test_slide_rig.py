@@ -1,7 +1,5 @@
 """The simulated slides: levels and spectra follow from force, speed and material; sessions leave a fingerprint."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

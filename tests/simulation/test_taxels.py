@@ -1,7 +1,5 @@
 """Test that the forces on taxels add up, and can be computed from counts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Surfaces of the simulated materials, the effect of an aperture, and how well their spectra separate them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

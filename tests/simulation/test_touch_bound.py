@@ -1,7 +1,5 @@
 """Compare the expected reading and its minimum error with closed forms and brute force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The hand's path: its workspace, its smoothness, and the profile that was published."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,8 +3,6 @@
 Slides of one material have correlated errors, so certainty is counted by materials, not by slides.
 """
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from itertools import product

@@ -12,8 +12,6 @@ so this is close to the best classifier of texture, but no strict bound; and one
 can beat it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

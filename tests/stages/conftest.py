@@ -1,7 +1,5 @@
 """Define a recording without a store, for stages that are called as plain functions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

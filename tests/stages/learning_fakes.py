@@ -1,7 +1,5 @@
 """Build synchronized recordings with the columns that learning stages read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

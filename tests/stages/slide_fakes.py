@@ -1,7 +1,5 @@
 """Build recordings of a BioTac that an iiwa draws over a material."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 

@@ -1,7 +1,5 @@
 """Test stages on sensors of any unit: thresholds from the noise at rest, slides by load, quaternions of any name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

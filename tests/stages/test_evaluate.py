@@ -1,7 +1,5 @@
 """Test that the evaluate stage finds the task of a model and hands the model over."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

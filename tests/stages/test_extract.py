@@ -1,7 +1,5 @@
 """Compare channels of cameras, the brightness on a coarse grid, with numpy's on decoded images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

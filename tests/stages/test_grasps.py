@@ -1,7 +1,5 @@
 """Test that raw grasps are cut down to the object's points and one reading."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

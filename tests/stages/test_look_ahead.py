@@ -1,7 +1,5 @@
 """Test that stages without look-ahead give a truncated recording the same rows as the full one."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from functools import cache

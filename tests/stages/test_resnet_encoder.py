@@ -1,7 +1,5 @@
 """The encoder of docs/extending/encoder.md, a ResNet of torchvision, with weights from a local file."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test contacts and slips of constructed, simulated and, where they are at hand, published recordings."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test that `segment losses` marks when an object leaves the fingers."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

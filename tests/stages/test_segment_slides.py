@@ -1,7 +1,5 @@
 """Test slides cut from constructed recordings, synchronized or not, and from published ones where they are at hand."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test that the simulate stage hands its params to the rig."""
 
-from __future__ import annotations
-
 from tacpipe.plugins.registry import load
 
 simulate = load("simulate.forward")

@@ -1,7 +1,5 @@
 """Test the table that the split stage writes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

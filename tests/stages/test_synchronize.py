@@ -1,7 +1,5 @@
 """Test streams on one clock: values, types, masks and refusals."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Test that the train stage hands its params to the task, and that its presets have the params of their names."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test the stage train.touch, and the use of its model from the store for one grasp."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Run Azurite, Microsoft's emulator of Azure Blob Storage (`npm install -g azurite`), for a test."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import hashlib

@@ -1,7 +1,5 @@
 """Offer every place that may keep a store to one suite; the real server is started once, for tests marked ``long``."""
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Open stores for tests: a folder, memory, a small server of S3's protocol in this process, and SeaweedFS."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Define a bucket in which something else happens before one of the requests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

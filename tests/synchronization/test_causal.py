@@ -1,7 +1,5 @@
 """Test that rows computed while samples arrive equal those of `synchronize` on the full recording."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

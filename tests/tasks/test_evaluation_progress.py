@@ -1,7 +1,5 @@
 """An evaluation shows how far it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

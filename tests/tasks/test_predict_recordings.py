@@ -1,7 +1,5 @@
 """From Python a loaded model predicts recordings as the command does."""
 
-from __future__ import annotations
-
 import inspect
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves: which channels share a plot, and under which names."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 

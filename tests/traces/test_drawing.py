@@ -1,7 +1,5 @@
 """Colours, the carpet and the small picture of a notebook."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Forecasts next to what was measured."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spans: labels of rows, gaps and events."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Taxels over time: vectors, level without load, scale of colours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 import pytest

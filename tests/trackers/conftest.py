@@ -1,7 +1,5 @@
 """A project in which the forward chain has run, and the trackers of `tests.trackers.fakes` are installed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path

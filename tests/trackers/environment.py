@@ -4,8 +4,6 @@
 environment that runs this.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import sysconfig

@@ -1,7 +1,5 @@
 """Trackers of a third party: one that keeps what it is called with, and one that fails where it is asked to."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

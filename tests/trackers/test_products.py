@@ -3,8 +3,6 @@
 They need an environment of their own: `make test-trackers` makes it and runs these tests.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Check the calls of trackers, and that no tracker changes or ends a training."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

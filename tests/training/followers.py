@@ -1,7 +1,5 @@
 """Followers of trainings: one remembers its calls, one interrupts the training."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

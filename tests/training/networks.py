@@ -1,7 +1,5 @@
 """Every network that `loop.train` trains, each in a training of seconds, with what is random in it switched on."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from functools import partial

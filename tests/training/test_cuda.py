@@ -1,7 +1,5 @@
 """Train on a GPU: it learns what the processor learns, and a model can be used and resumed on either."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

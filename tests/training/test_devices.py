@@ -1,7 +1,5 @@
 """Check the device of trainings: found, refused if it is absent, stated in records, and no part of a key."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Follow a training: the growing file, the lines and the bar, and the sentence of an interrupt."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import json

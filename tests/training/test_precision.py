@@ -1,7 +1,5 @@
 """Products in bfloat16: what training computes with fewer digits, and what stays as it was."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

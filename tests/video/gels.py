@@ -1,7 +1,5 @@
 """Draw gels with printed markers at known places."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tacpipe.arrays import Bytes, Floats

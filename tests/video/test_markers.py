@@ -1,7 +1,5 @@
 """Markers of drawn gels are found, ordered and tracked to within 0.2 px of where they were drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

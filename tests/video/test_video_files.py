@@ -1,7 +1,5 @@
 """Video files become streams of frames, packet for packet, and streams become files again."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

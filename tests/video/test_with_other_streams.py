@@ -1,7 +1,5 @@
 """Recordings that also hold a stream of frames: what shows them, and stages and exports that do not read frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Write small videos with PyAV, and read them by PyAV alone, as what tacpipe reads is compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from fractions import Fraction

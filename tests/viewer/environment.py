@@ -3,8 +3,6 @@
 All other packages are those of the environment that runs this.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import sysconfig

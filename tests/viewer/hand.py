@@ -1,7 +1,5 @@
 """A recording of a hand: two fingers, an arm and a camera, whose values a test knows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pyarrow as pa
 

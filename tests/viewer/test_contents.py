@@ -1,7 +1,5 @@
 """Drawn contents of a recording, also as a picture."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Markers of a gel in the frames of its camera, at the places where the gel was drawn."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of `tacpipe view`, read back with Rerun's own reader; `make test-viewer` has the environment for it."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

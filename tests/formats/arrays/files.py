@@ -1,7 +1,5 @@
 """HDF5 files and Zarr stores as other programs write them, written with h5py and zarr."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

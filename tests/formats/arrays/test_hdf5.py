@@ -1,7 +1,5 @@
 """HDF5 files, as h5py, robomimic and ALOHA write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

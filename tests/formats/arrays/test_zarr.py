@@ -1,7 +1,5 @@
 """Zarr stores, as zarr writes them: folders and zip files, format 2 and 3."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tomllib

@@ -1,7 +1,5 @@
 """Bags that rosbags' writers wrote, and what becomes of their messages."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path

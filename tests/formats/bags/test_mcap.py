@@ -1,7 +1,5 @@
 """MCAP files of JSON and other messages, as mcap's writer wrote them, and one recording in four formats."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

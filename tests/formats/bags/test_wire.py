@@ -1,7 +1,5 @@
 """Values of messages, against rosbags' own deserialization."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any

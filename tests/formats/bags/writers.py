@@ -1,7 +1,5 @@
 """Bags and MCAP files as other libraries write them: rosbags' writers and mcap's."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """LeRobot datasets as LeRobot writes them, version 2.1 and 3.0, written with pyarrow and json."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """LeRobot datasets, version 2.1 and 3.0."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

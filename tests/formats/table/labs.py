@@ -1,7 +1,5 @@
 """A lab's folder, written by pandas and numpy as a lab's own scripts write it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

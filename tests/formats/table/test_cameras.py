@@ -1,7 +1,5 @@
 """Video files and folders of images become streams of frames of a lab's own recordings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Arrays, workbooks, encodings and stamps as labs write them, compared with what numpy and pandas wrote."""
 
-from __future__ import annotations
-
 import datetime
 from pathlib import Path
 from typing import Any

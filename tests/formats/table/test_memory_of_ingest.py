@@ -1,7 +1,5 @@
 """The memory that `tacpipe ingest` takes, which must not grow with the file."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Faults, each applied to any tool in the same way; their effect is observed, never assumed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

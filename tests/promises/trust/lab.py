@@ -1,7 +1,5 @@
 """A folder in which one tool runs the chain of `steps`, and is done harm."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -7,8 +7,6 @@
 What a test wants of a step stands in the environment, which is part of no tool's key.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -6,8 +6,6 @@ A chain of three steps over eight recordings is the same for all three, and each
 cell is found by looking at what the tool serves afterwards. Needs Linux; the full disk needs `unshare` (util-linux) besides.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

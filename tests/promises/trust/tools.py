@@ -1,7 +1,5 @@
 """The three tools, each set up as its documentation recommends, with the same few operations."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

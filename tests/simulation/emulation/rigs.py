@@ -1,7 +1,5 @@
 """Rigs and links for tests of the emulator."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Each fault changes the bytes as described, is noted in the ledger, and leaves all other bytes unchanged."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

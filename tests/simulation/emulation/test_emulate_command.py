@@ -1,7 +1,5 @@
 """The command that emulates a rig."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A host reads over each kind of link the samples that the ledger lists as sent."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """When frames go out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Emulated sensors see one world, the same for the same seed, in their own units and types."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bits on a line that is read at the wrong speed, and the text that an slcan adapter speaks."""
 
-from __future__ import annotations
-
 import can
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Test that vendors' clients read from the emulator what its ledger records as sent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

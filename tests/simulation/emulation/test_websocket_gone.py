@@ -1,7 +1,5 @@
 """Test a websocket whose client has disconnected when the emulated device closes it."""
 
-from __future__ import annotations
-
 import errno
 import socket
 from typing import Any

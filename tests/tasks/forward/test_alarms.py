@@ -1,7 +1,5 @@
 """Alarms on tracks made by hand: levels from quiet rows, and events that are led or missed."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """Warnings of changes, against recordings whose changes were put there and forecasts whose foresight is known."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Forecasts of rigs other than the paper's: no arm, an arm of any name, one axis, other units."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Compare causal rows and planned motion with those of full recordings and with the rules for missing plans."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Compare evaluation with numpy on the columns of the recordings, and check the files of a result."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Test predictions from windows and plans in Python, and their errors."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

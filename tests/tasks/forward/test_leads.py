@@ -1,7 +1,5 @@
 """Leads and false alarms, counted by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Test that an evaluation needs memory only for the stored recording and one batch of windows."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test that predictions of recordings are tables of the forecaster's results, at the time of prediction."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

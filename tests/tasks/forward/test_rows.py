@@ -1,7 +1,5 @@
 """Rows of several recordings one after the other, and the windows that are picked from them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The score for slips, on forecasts made by hand: rise to the peak, fall behind it, over what presses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

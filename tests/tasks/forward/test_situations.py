@@ -1,7 +1,5 @@
 """Check situations of windows, and that errors by situation add up to those of all windows."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Slip alarms on tracks made by hand: levels from quiet rows, and slips that are led or missed."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

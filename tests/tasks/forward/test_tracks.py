@@ -1,7 +1,5 @@
 """Test how a forecaster reads a recording: rows, columns, hand velocity, and rate."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

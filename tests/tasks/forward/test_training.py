@@ -1,7 +1,5 @@
 """Test the training of a model: its data, its files, and reproducibility."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Quantiles of a forecaster: calibrated on recordings, predicted in tables and arrays, evaluated next to persistence's."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

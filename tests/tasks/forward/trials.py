@@ -1,7 +1,5 @@
 """Small recordings, params and models for the tests of the forward task."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Models of the task from params to metrics, on small slides."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from functools import cache

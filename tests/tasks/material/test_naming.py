@@ -1,7 +1,5 @@
 """Classes whose labels are text, or of another label than material."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A calibrated classifier: probabilities, the answer unknown, and how both are measured with a material left out."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Models of spectra from params to metrics: a sensor names materials that only another one was told of."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

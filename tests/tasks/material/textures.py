@@ -1,7 +1,5 @@
 """Small slides of two unlike sensors that feel the same few textures, and params of small models."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recordings of two fingers in which the shear rises before a slip, for tests of the task slip."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Live sessions with a slip model: what is published is what `predict --causal` gives, to the bit."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

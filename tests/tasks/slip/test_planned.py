@@ -1,7 +1,5 @@
 """Planned motion as input of slip models: what is read of a plan, and that nothing measured is read ahead."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report of slip results: folds are pooled, and controls are marked."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models of the task slip: training, prediction, evaluation, calibration, and the files of a model."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """WindowScores of touch, their labels, and the arithmetic of scores."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

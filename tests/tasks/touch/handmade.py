@@ -1,7 +1,5 @@
 """Small grasps made by hand, whose touch follows from their opening, and params of small models."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

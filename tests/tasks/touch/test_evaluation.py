@@ -1,7 +1,5 @@
 """Measures of a model against scikit-learn's on the predictions that are written, and who counts as seen and known."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

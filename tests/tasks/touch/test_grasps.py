@@ -1,7 +1,5 @@
 """Reading grasps of a dataset: what they become, and what is refused with the recording's name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The inputs of a PointNet, in all six modes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

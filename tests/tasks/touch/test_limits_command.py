@@ -1,7 +1,5 @@
 """The command ``tacpipe limits``."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """The learning of a network of touch: batches, losses by hand, and draws that repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

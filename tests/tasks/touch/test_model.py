@@ -1,7 +1,5 @@
 """Quantiles of predicted readings: calibrated on validation grasps, predicted, and evaluated next to the constant's."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A loaded model: what it says of one grasp, of many, and whom it refuses."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Repeatability is that of readings whose noise is known, and a learning curve is of grasps that were not trained on."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """How a model of touch comes about: its files, its choices, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Handmade results with the parts that the report reads."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The page's part on live sessions: there where a result has them, and nowhere else."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

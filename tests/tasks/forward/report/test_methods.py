@@ -1,7 +1,5 @@
 """Error sums as arrays."""
 
-from __future__ import annotations
-
 import io
 import json
 from typing import Any

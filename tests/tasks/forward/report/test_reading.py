@@ -4,8 +4,6 @@ Persistence errs by ``step`` a window and channel, and a model by its ratio of t
 ratio over windows. r1 and r2 are of known objects and hold 10 and 30 windows, r3 and r4 of unseen ones and hold 20 each.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from typing import Any

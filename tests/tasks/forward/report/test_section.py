@@ -1,7 +1,5 @@
 """Check the section of forecasts beyond the comparison."""
 
-from __future__ import annotations
-
 import json
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Errors by situation, pooled over the runs of a method."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

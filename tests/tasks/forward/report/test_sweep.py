@@ -1,7 +1,5 @@
 """Check the losses of codecs, by kind and width."""
 
-from __future__ import annotations
-
 from tacpipe.tasks.forward.report import representations
 from tests.tasks.forward.report.result_fakes import codec, result
 

@@ -1,7 +1,5 @@
 """Results of the task ``material`` made by hand, with what the report reads of real ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any

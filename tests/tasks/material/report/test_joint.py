@@ -1,7 +1,5 @@
 """Sentences on joint learning and its controls."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

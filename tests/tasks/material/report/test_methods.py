@@ -1,7 +1,5 @@
 """Results are grouped into methods, which get names."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The slides that count."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The section of materials on calibrated classifiers: rates worked by hand, curves, and the answer unknown."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

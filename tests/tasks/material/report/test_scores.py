@@ -1,7 +1,5 @@
 """Accuracies of pooled runs against those worked out by hand: a sensor has 20 slides, 5 of each of 4 materials."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The tables against numbers worked out by hand."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

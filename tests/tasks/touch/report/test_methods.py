@@ -1,7 +1,5 @@
 """Results are grouped into methods, which get names."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from tacpipe.comparison.runs import Method

@@ -1,7 +1,5 @@
 """Predictions that are read of a result are those of the fakes."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The section of touch on quantiles: coverage pooled over runs, by target and electrode, worked by hand."""
 
-from __future__ import annotations
-
 import io
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """The whole section of touch, and the numbers that go into its charts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pyarrow as pa

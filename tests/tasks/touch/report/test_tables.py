@@ -1,7 +1,5 @@
 """The tables against numbers worked out by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from tacpipe.comparison.runs import Method
