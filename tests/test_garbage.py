@@ -292,8 +292,7 @@ def test_leases_of_killed_processes_are_swept_up_and_those_of_others_stay(lab: L
 
 def test_two_collections_do_not_run_at_once(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tacpipe.store.leases._try_lock", lambda path: None)
+    with lab.store.leases.exclusive("gc"):
         failed = lab.call("store gc")
     assert failed.code == 6
 

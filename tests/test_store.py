@@ -310,9 +310,11 @@ def test_settling_syncs_each_folder_above_the_names_once_and_those_within_first(
     store = Store(tmp_path / "store")
     store.prepare()
     synced: list[str] = []
-    monkeypatch.setattr("tacpipe.store.store.sync_folder", lambda path: synced.append(str(Path(path))))
-    store.settle(["objects/ab/x", "objects/ab/y", "records/cd/z"])
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(str(Path(f"/proc/self/fd/{handle}").readlink())))
     folders = [str(tmp_path / "store" / name) for name in ("objects/ab", "objects", "records/cd", "records", "")]
+    for folder in (folders[0], folders[2]):
+        Path(folder).mkdir()
+    store.settle(["objects/ab/x", "objects/ab/y", "records/cd/z"])
     assert sorted(synced) == sorted(folders)
     assert synced.index(folders[0]) < synced.index(folders[1]) < synced.index(folders[4])
 

@@ -4,23 +4,20 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.recording import appending
-from tacpipe.store.records import RecordingEntry
-
-ENTRY: RecordingEntry = {"attributes": {}, "shards": {}}
+from tests.conftest import Lab
+from tests.fake_recordings import write_dataset
 
 
 @pytest.mark.parametrize(
     ("name", "existing_name"), [("cup", "Cup"), ("CUP", "Cup"), ("Cup-001", "cup-001"), ("STRASSE", "straße")]
 )
 def test_a_name_that_a_recording_has_but_for_case_is_refused_and_numbered_where_it_was_taken_meanwhile(
-    name: str, existing_name: str, monkeypatch: pytest.MonkeyPatch
+    lab: Lab, name: str, existing_name: str
 ) -> None:
-    before = Manifest(ACQUIRE, 1, recordings={existing_name: ENTRY, "another": ENTRY})
-    monkeypatch.setattr(appending, "existing_manifest", lambda output: before)
+    write_dataset(Path("rec"), {existing_name: ({}, {}), "another": ({}, {})})
     with pytest.raises(UsageError, match=f"with these names: {existing_name}"):
         appending.refuse_existing_names(Path("rec"), ["bowl", name])
     appending.refuse_existing_names(Path("rec"), ["bowl", f"{name}-2"])
-    assert appending._free_name(name, before.recordings) == f"{name}-2"
+    assert appending._free_name(name, lab.manifest("rec").recordings) == f"{name}-2"

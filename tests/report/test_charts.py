@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.report import charts
+from tacpipe.report import charts, context
 from tacpipe.report.charts import Curve, Dot
 
 
@@ -90,3 +90,18 @@ def test_intervals_wider_than_the_differences_of_methods_are_drawn_whole() -> No
     dots = [charts.Dot(f"m{place}", 0.0144 + 1e-5 * place, -0.03, 0.05) for place in range(5)]
     rows = charts.ranking(dots, "skill")["data"]["values"]
     assert {(row["low"], row["high"], row["off"]) for row in rows} == {(-0.03, 0.05, "")}
+
+
+def test_runs_are_thin_lines_and_their_mean_a_thick_one_as_long_as_the_shortest() -> None:
+    rows = context.loss_chart({"a": [[1.0, 0.5], [1.0, 0.4, 0.3]], "b": [[1.0]]}, "loss", log=True)["data"]["values"]
+    thick = [(row["name"], row["x"], row["y"]) for row in rows if not row["thin"]]
+    assert thick == [("a", 1.0, 1.0), ("a", 2.0, np.mean([0.5, 0.4])), ("b", 1.0, 1.0)]
+    assert [row["thin"] for row in rows].count(True) == 5
+
+
+def test_a_training_of_one_epoch_is_seen_as_points() -> None:
+    marks = [
+        [layer["mark"]["type"] for layer in context.loss_chart({"training": [curve]}, "loss")["layer"]]
+        for curve in ([0.5], [0.5, 0.4])
+    ]
+    assert ["circle" in layer_marks for layer_marks in marks] == [True, False]

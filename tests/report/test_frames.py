@@ -12,7 +12,7 @@ from tacpipe.comparison.runs import RecordingOutcome as Outcome
 from tacpipe.report import page
 from tacpipe.report.blocks import ImageRow, Section
 from tacpipe.report.frames import SHOWN, frame_folds, holds_cameras
-from tests.exports.test_videos import decoded
+from tests.exports.test_lerobot import decoded
 from tests.fake_recordings import FakeRecording
 from tests.stages.test_extract import frames_of
 from tests.video import videos

@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Section, SmallPrint
 from tacpipe.tasks.forward.report import events, methods, representations
+from tacpipe.tasks.forward.report.skill import situation_folds, skill_in_situation
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.forward.report.result_fakes import MANIFEST, codec, errors, result
@@ -276,3 +278,87 @@ def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -
     for name in begins:
         (sentence,) = texts[name]
         assert sentence.startswith(begins[name]) and "by 9.5 ms on average and at most 26.25 ms" in sentence
+
+
+def run(**measured: tuple[int, float, float, float]) -> Any:
+    """A run with windows, errors of persistence and of the model, and skill by situation."""
+    tree = {
+        name.replace("_", " "): {
+            "windows": windows,
+            "mae_counts": {"persistence": {"mean": persistence}, "model": {"mean": model}},
+            "skill": {"mean": {"mean": skill, "low": skill - 0.1, "high": skill + 0.1}},
+        }
+        for name, (windows, persistence, model, skill) in measured.items()
+    }
+    return SimpleNamespace(details=SimpleNamespace(metrics=SimpleNamespace(situations=tree)))
+
+
+def test_several_runs_are_weighted_by_their_windows_and_one_has_its_interval() -> None:
+    first, second = (
+        run(closing=(100, 40.0, 30.0, 0.2), slipping=(50, 80.0, 60.0, 0.3)),
+        run(closing=(300, 20.0, 20.0, 0.0)),
+    )
+    method: Any = SimpleNamespace(name="mixed", runs=[first, second])
+    pooled = skill_in_situation(method, "closing")
+    assert pooled is not None
+    assert pooled["windows"] == 400
+    assert (pooled["persistence"], pooled["model"]) == pytest.approx((25.0, 22.5))
+    assert pooled["skill"] == pytest.approx(0.05)
+    assert pooled["part"] == pytest.approx((4000 + 6000) / (4000 + 6000 + 4000))
+    assert np.isnan(pooled["low"])
+    single = skill_in_situation(SimpleNamespace(name="mixed", runs=[first]), "slipping")  # type: ignore[arg-type]
+    assert single is not None and (single["low"], single["high"]) == pytest.approx((0.2, 0.4))
+    assert skill_in_situation(method, "releasing") is None
+
+
+def test_results_without_situations_have_no_table() -> None:
+    empty: Any = SimpleNamespace(methods=[SimpleNamespace(name="gru", runs=[run()])])
+    assert situation_folds(empty) == []
+    full: Any = SimpleNamespace(methods=[SimpleNamespace(name="mixed", runs=[run(closing=(100, 40.0, 30.0, 0.2))])])
+    (fold,) = situation_folds(full)
+    assert fold.title == "By situation"
+    table: Any = fold.blocks[0]
+    assert [getattr(cell, "text", cell) for cell in table.rows[0].cells][:4] == ["closing", "mixed", "100", "100.0 %"]
+
+
+def test_codecs_are_read_once_each_wherever_they_lie() -> None:
+    with_codec = result()
+    with_codec.files["codec.json"] = codec(8).files["codec.json"]
+    assert [
+        codec_read["latents"] for codec_read in representations.read_codecs([with_codec, codec(8), result(), codec(4)])
+    ] == [8, 4]
+
+
+def test_losses_of_one_width_are_averaged_and_series_are_kept_apart() -> None:
+    codecs = representations.read_codecs(
+        [
+            codec(8, loss=0.5),
+            codec(8, loss=0.25),
+            codec(4),
+            codec(8, "autoencoder", frames=2),
+            codec(8, of="increments"),
+        ]
+    )
+    losses = {(loss.series, loss.latents): loss for loss in representations.codec_losses(codecs)}
+    assert set(losses) == {("PCA", 8), ("PCA", 4), ("AE-C2", 8), ("PCA increments", 8)}
+    assert losses["PCA", 8].codecs == 2
+    assert losses["PCA", 8].mse_standardised == 0.375
+    assert losses["PCA", 8].mae_counts == 7.5
+    assert losses["PCA", 8].part == "val"
+
+
+def test_losses_are_of_the_fits_own_rows_where_one_codec_held_none_out() -> None:
+    fitted = codec(8, reconstruction={"train": {"rows": 1, "mse_standardised": 0.125, "mae_counts": 1.0}})
+    losses = representations.codec_losses(representations.read_codecs([fitted, codec(4, loss=0.5)]))
+    assert [(loss.latents, loss.part, loss.mse_standardised) for loss in losses] == [
+        (4, "train", 0.25),
+        (8, "train", 0.125),
+    ]
+
+
+def test_the_papers_codec_is_the_one_of_the_nearest_width() -> None:
+    paper_codec = representations.paper_codec(
+        representations.read_codecs([codec(8), codec(16), codec(20, "autoencoder")]), "PCA", 20
+    )
+    assert paper_codec is not None and paper_codec["latents"] == 16
+    assert representations.paper_codec([], "PCA", 20) is None

@@ -1,11 +1,12 @@
 """Parts of the slow and of the exhaustive tests: each commit runs another one, and together they are all tests."""
 
 import re
+import signal
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import left_out
+from tests.conftest import left_out, run_python
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,3 +28,13 @@ def test_what_ci_samples_begins_with_another_test_at_each_commit() -> None:
     assert len(samples) == 2
     for modulo, step in samples:
         assert {commits % int(modulo) + 1 for commits in range(int(step))} == set(range(1, int(step) + 1))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGIO])
+def test_a_signal_that_ends_pytest_is_named_before_it_does(number: signal.Signals) -> None:
+    program = f"import os\nfrom tests import conftest\nconftest.name_signals()\nos.kill(os.getpid(), {int(number)})"
+    environment = {"PYTEST_CURRENT_TEST": "test_x (call)"}
+    process = run_python(Path(__file__).parents[1], "-c", program, environment=environment)
+
+    assert process.returncode == -number
+    assert f"of pytest ends by {number.name} in test_x (call):" in process.stderr
