@@ -48,6 +48,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Passes requests on, and fails where its proxy is to."""
 
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # Otherwise the content waits 40 ms for the client to acknowledge the headers.
     proxy: Proxy
     upstream: tuple[str, int]
 
