@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -49,6 +50,11 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
         import dask
         from distributed import Client
 
+    if not shutil.which("sbatch"):
+        raise TacpipeError(
+            "There is no sbatch on this computer: the executor slurm submits jobs from where Slurm's commands are "
+            "installed, as on a login node."
+        )
     jobs = jobs or JOBS
     with (
         dask_workers.quiet(),
@@ -103,7 +109,7 @@ def _create_certificate(folder: Path) -> Security:
 def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, config: Any) -> Iterator[SLURMCluster]:
     """Submit ``jobs`` jobs, yield their cluster, and cancel them at the end of the block.
 
-    Raises `TacpipeError` if there is no ``sbatch`` or Slurm refuses a job.
+    Raises `TacpipeError` if Slurm refuses a job.
     """
     from dask_jobqueue import SLURMCluster
 
@@ -138,11 +144,6 @@ def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, conf
             cluster.worker_spec.update(cluster.new_worker_spec())
         try:
             cluster.sync(submit)
-        except FileNotFoundError as error:
-            raise TacpipeError(
-                "There is no sbatch on this computer: the executor slurm submits jobs from where Slurm's commands are "
-                "installed, as on a login node."
-            ) from error
         except RuntimeError as error:
             raise TacpipeError(f"Slurm refused a job: {_reason(str(error))}") from error
         numbers = _numbers(cluster)
