@@ -520,12 +520,11 @@ class UnknownDescription(TypedDict):
 class MaterialConfig(ModelConfig, StoredNaming):
     """``config.json`` of a material model."""
 
-    split: str  # description; a mapping in older models
+    split: str  # description
     quantities: Sequence[str]
     sensors: dict[str, StoredLayout]
     classes: list[int]
     absent: NotRequired[list[str]]  # quantities that no sensor has
-    seconds: NotRequired[float]  # duration of the training, in older models
     counts: dict[str, dict[str, int]]  # role -> sensor -> number of slides
     shapes: NotRequired[dict[str, StoredShape]]  # networks only
     scaling: NotRequired[dict[str, dict[str, list[float]]]]

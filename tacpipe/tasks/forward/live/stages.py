@@ -63,7 +63,7 @@ def refuse_look_ahead(config: ForwardConfig, steps: Sequence[Step]) -> None:
     ``config`` is the model's configuration, ``steps`` are its preprocessing stages.
     """
     look_ahead = config.get("look_ahead")
-    if look_ahead is None:  # a model of an older version, or recordings without this information
+    if look_ahead is None:  # the recordings lack this information
         interpolated = [
             step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
         ]

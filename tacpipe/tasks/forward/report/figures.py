@@ -16,7 +16,7 @@ from tacpipe.report.blocks import Cell, Chart, Charts, Fold, SmallPrint, Table, 
 from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, loss_chart, median_run
 from tacpipe.tasks.forward import headline
-from tacpipe.tasks.forward.headline import ForwardMetrics, ForwardScores, IntervalsByStep
+from tacpipe.tasks.forward.headline import ForwardMetrics, ForwardScores
 from tacpipe.tasks.forward.report import methods
 from tacpipe.tasks.forward.report.methods import ComparedRun, ForwardResult, Method
 
@@ -65,13 +65,13 @@ def predictor_title(predictor: str) -> str:
 
 def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Chart]:
     predictors, rate_hz = run.details.metrics.fresh.predictors, run.details.rate_hz
-    steps = sorted(int(name[1:]) for name in _both_groups(predictors[names[0]]["mse_counts"]) if name != "mean")
+    steps = sorted(int(name[1:]) for name in predictors[names[0]]["mse_counts"]["both"] if name != "mean")
     x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
     lines = [
         Curve(
             predictor_title(name),
             x,
-            [float(np.sqrt(_both_groups(predictors[name]["mse_counts"])[f"t{step}"])) for step in steps],
+            [float(np.sqrt(predictors[name]["mse_counts"]["both"][f"t{step}"])) for step in steps],
             dashed=name != MODEL,
         )
         for name in names
@@ -90,14 +90,14 @@ def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Char
 def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> list[Table]:
     predictors = metrics.fresh.predictors
     groups = predictors[names[0]]["mae_counts"]
-    steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in _both_groups(groups)] + ["mean"]
+    steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in groups["both"]] + ["mean"]
     heads = ["", *(name.replace("t", "t+") if name != "mean" else name for name in steps)]
 
     def cells(errors: Mapping[str, float]) -> list[Cell]:
         return [number(errors[step]) for step in steps]
 
-    absolute = {name: _both_groups(scores["mae_counts"]) for name, scores in predictors.items()}
-    squared = {name: _both_groups(scores["mse_counts"]) for name, scores in predictors.items()}
+    absolute = {name: scores["mae_counts"]["both"] for name, scores in predictors.items()}
+    squared = {name: scores["mse_counts"]["both"] for name, scores in predictors.items()}
     tables = [
         table(title, heads, [[predictor_title(name), *cells(errors[name])] for name in names])
         for title, errors in ((f"Mean absolute error ({unit})", absolute), (f"Mean squared error ({unit}²)", squared))
@@ -116,7 +116,7 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
     rows = [
         [f"{predictor_title(name)}, {group}", *cells(predictors[name]["mae_counts"][group])]
         for group in groups
-        if group not in ("both", "all")
+        if group != "both"
         for name in names[:2]
     ]
     tables.append(table(f"Mean absolute error by sensor and axis ({unit})", heads, rows))
@@ -128,12 +128,12 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
             rows += [
                 [
                     f"{objects}, {predictor_title(predictor)} ({unit})",
-                    *cells(_both_groups(part.predictors[predictor]["mae_counts"])),
+                    *cells(part.predictors[predictor]["mae_counts"]["both"]),
                 ]
                 for predictor in _ordered_predictors(part)[:2]
             ]
             rows.append(
-                [f"{objects}, skill", *(_error_cell(_single_ratio_skill(part).get(step, {})) for step in steps)]
+                [f"{objects}, skill", *(_error_cell(part.skill[headline.GEOMETRIC].get(step, {})) for step in steps)]
             )
     return [*tables, table("Known and unseen objects: mean absolute error, and skill", heads, rows)] if rows else tables
 
@@ -143,7 +143,7 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
     predictors = metrics.fresh.predictors
     if "codec" not in predictors:
         return ""
-    floor, baseline = (_both_groups(predictors[name]["mse_counts"]) for name in ("codec", "persistence"))
+    floor, baseline = (predictors[name]["mse_counts"]["both"] for name in ("codec", "persistence"))
     steps = sorted(int(name[1:]) for name in floor if name != "mean")
     lost = [step for step in steps if floor[f"t{step}"] >= baseline[f"t{step}"]]
     if not lost:
@@ -159,17 +159,12 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
 def _describe_seen(metrics: ForwardMetrics) -> str:
     """Return the errors on training recordings, which do not show how well the model generalizes."""
     seen = metrics.parts.get("seen")
-    described = _single_ratio_skill(seen).get("mean", {}) if seen else {}
+    described = seen.skill[headline.GEOMETRIC].get("mean", {}) if seen else {}
     if not seen or "mean" not in described:
         return ""
     count = counted(seen.counts["recordings"], "recordings")
     mean = blocks.signed(described["mean"])
     return f"Left out: {count} that were used for training or early stopping, with a mean skill of {mean}."
-
-
-def _single_ratio_skill(part: ForwardScores) -> IntervalsByStep:
-    """Return the skill from ratios of single recordings, or the pooled skill of results of older versions."""
-    return part.skill.get(headline.GEOMETRIC, part.skill.get("mse_counts", {}))
 
 
 def _error_cell(interval_tree: Mapping[str, float]) -> Cell:
@@ -178,11 +173,6 @@ def _error_cell(interval_tree: Mapping[str, float]) -> Cell:
         if "mean" in interval_tree
         else Cell("not defined")
     )
-
-
-def _both_groups(scores: Mapping[str, dict[str, float]]) -> dict[str, float]:
-    """Return the errors over all channels: ``both``, or ``all`` in results of older versions."""
-    return scores["both"] if "both" in scores else scores["all"]
 
 
 def _ordered_predictors(scores: ForwardScores) -> list[str]:

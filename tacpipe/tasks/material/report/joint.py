@@ -226,18 +226,16 @@ def difference_table(methods: Sequence[Method]) -> Table | None:
 
 
 def run_columns(run: ComparedRun) -> dict[str, str | Cell]:
-    """Return additional columns of the table of runs: training slides, epochs and seconds."""
+    """Return additional columns of the table of runs: training slides and epochs."""
     result = run.details
     learned = " + ".join(f"{count}" for _, count in sorted(result.learned.items()))
     best_epochs = result.config.get("validation", {}).get("epoch", {}) if result.history else {}
     # a single value if sensors were learned jointly
     slide_counts = dict.fromkeys(best_epochs[sensor] for sensor in ordered_sensors(best_epochs))
-    seconds = f"{float(result.config['seconds']):,.0f}" if "seconds" in result.config else NONE
     return {
         "slides learned from": learned or NONE,
         "kept epoch": " / ".join(str(epoch) for epoch in slide_counts) or NONE,
         "epochs": str(len(result.history) or NONE),
-        "seconds": seconds,
     }
 
 

@@ -98,10 +98,8 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
     @property
     def place(self) -> tuple[str, str]:
         """Split and layout of its slides; results are only pooled if both are equal."""
-        split = self.config.get("split", "")
         layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
-        scheme = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
-        return scheme, "authors" if "authors" in layouts else "time"
+        return str(self.config.get("split", "")), "authors" if "authors" in layouts else "time"
 
 
 Method = runs.Method[MaterialResult]

@@ -175,7 +175,7 @@ def _part(ratio: Mapping[str, float], names: Sequence[str]) -> dict[str, Any]:
     skill["mean"] = {"mean": 1 - mean, "low": 0.9 - mean, "high": 1.1 - mean}
     tree: dict[str, Any] = {
         "counts": {"windows": 40, "recordings": len(names), "recordings_without_window": 0, "effective_windows": 13},
-        "skill": {"mse_counts": skill, "mse_latent": skill},
+        "skill": {"mse_counts": skill, "mse_latent": skill, "mae_counts_geometric": skill},
     }
     for name, share in (("model", mean), ("persistence", 1.0), ("train_mean", 9.0), ("codec", 0.25)):
         scores = {f"t{step}": share * step for step in STEPS} | {"mean": 2 * share}

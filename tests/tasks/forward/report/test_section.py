@@ -197,18 +197,6 @@ def test_known_and_unseen_objects_are_apart_in_a_single_run() -> None:
     assert row[0] == "+0.625 | +0.525 to +0.725"  # 1 - the mean of 0.5 and 0.25
 
 
-def test_results_of_before_groups_were_renamed_are_still_read() -> None:
-    plain = result(ratio=RATIO)
-    old = json.loads(plain.files["metrics.json"])
-    for name in ("model", "persistence", "train_mean", "codec"):
-        for measure in ("mse_counts", "mae_counts"):
-            old[name][measure]["all"] = old[name][measure].pop("both")
-    del old["known"], old["unseen"]
-    plain.files["metrics.json"] = json.dumps(old).encode()
-    text = parts.words(forward(plain))
-    assert "model, sensor1" in text and "model, all" not in text
-
-
 @pytest.mark.parametrize("has_two_seeds", [False, True])
 def test_results_of_a_sensor_in_kilopascal_name_no_count(has_two_seeds: bool) -> None:
     results = [result("raw", seed, attributes={}, inputs={"unit": "kPa"}) for seed in range(2 if has_two_seeds else 1)]
