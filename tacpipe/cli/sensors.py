@@ -26,7 +26,7 @@ EMULATION = "tacpipe.cli.sensors"
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the group ``sensors`` to ``program``."""
+    """Add the group ``sensors`` to ``program``, without ``emulate`` if the simulation is not installed."""
     group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
     group.command("list")(list_)
     group.command("probe")(probe)
@@ -46,13 +46,13 @@ def list_(as_json: AsJson = False) -> None:
     if as_json:
         terminal.result_json({"schema_version": SCHEMA_VERSION, "sensors": rows})
         return
-    table = [["sensor", "links", "rate", "baud", "what it is"]]
+    lines = [["sensor", "links", "rate", "baud", "what it is"]]
     for row in rows:
         values = {"links": row["links"], "rate_hz": row["rate_hz"], "baud": row["baud"], "summary": row["summary"]}
-        table.append([row["name"], *(_cell(key, value) for key, value in values.items())])
-    widths = [max(len(line[column]) for line in table) for column in range(len(table[0]))]
-    for line in table:
-        terminal.result("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+        lines.append([row["name"], *(_cell(key, value) for key, value in values.items())])
+    widths = [max(len(cells[column]) for cells in lines) for column in range(len(lines[0]))]
+    for cells in lines:
+        terminal.result("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
 
 
 def probe(
@@ -98,6 +98,7 @@ class SensorRow(TypedDict):
 
 
 def _sensor_row(name: str) -> SensorRow:
+    """Return the row of a sensor in the list; one that cannot be loaded has its error as the summary."""
     try:
         kind = registry.load_sensor(name)
     except TacpipeError as error:  # An error in one plug-in must not hide the other sensors.
@@ -116,11 +117,14 @@ def _sensor_row(name: str) -> SensorRow:
 
 
 def _cell(key: str, value: Any) -> str:
+    """Return a value of the list of sensors as text, "-" for none."""
     if not value:
         return "-"
     if key == "links":
         return ", ".join(value)
-    return f"{value:g} Hz" if key == "rate_hz" else f"{value:,}" if key == "baud" else str(value)
+    if key == "rate_hz":
+        return f"{value:g} Hz"
+    return f"{value:,}" if key == "baud" else str(value)
 
 
 def _address(port: str) -> Address:
@@ -130,6 +134,7 @@ def _address(port: str) -> Address:
 
 
 def _usb_id(port: str) -> str:
+    """Return the vendor and product of a USB serial port, or "" for any other address."""
     from tacpipe.links import ports
 
     if not port.startswith(("/", "serial:")):
@@ -145,6 +150,7 @@ def _report(step: str) -> None:
 
 
 def _text(report: Report) -> str:
+    """Return the report on a port as text: the recognised sensors and lines for a rig file, or why there are none."""
     if report.error:
         return f"{report.address}: {report.error}"
     if not report.heard and not report.findings:
@@ -167,18 +173,13 @@ def _stanza(report: Report) -> list[str]:
     if report.baud and report.baud != type(candidate.sensor).__dict__.get("baud"):
         options["baud"] = report.baud
     notes = candidate.sensor.guesses
+    option_lines = [f"options = {config_text.toml_value(options)}"] if options else []
     return [
         "[[stream]]",
         f'name = "{candidate.kind.replace("-", "_")}"',
         f'sensor = "{candidate.kind}"',
         f'transport = "{report.address}"',
-        *(
-            _format_options(options, notes)
-            if notes
-            else [f"options = {config_text.toml_value(options)}"]
-            if options
-            else []
-        ),
+        *(_format_options(options, notes) if notes else option_lines),
     ]
 
 
@@ -218,6 +219,7 @@ class PortJson(TypedDict):
 
 
 def _json(report: Report) -> PortJson:
+    """Return the JSON value of the report on a port."""
     return {
         "address": report.address,
         "baud": report.baud,
@@ -245,8 +247,8 @@ EMULATE_EXAMPLE = (
     "addresses: give it to `tacpipe acquire`. FOLDER/ledger lists at the end what was sent and which bytes were changed."
     "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
 )
-EMULATION_MARK = b"\nsimulated = true\n"  # Line that marks the rig file of an emulated rig
-SWITCH_S = 0.0005  # Maximum delay of the pacing thread by the planning thread; Python's 5 ms would be visible at 1 kHz
+EMULATION_MARK = b"\nsimulated = true\n"  # line that marks the rig file of an emulated rig
+SWITCH_S = 0.0005  # maximum delay of the pacing thread by the planning thread; Python's 5 ms would be visible at 1 kHz
 
 
 def add_emulate(program: typer.Typer) -> None:
@@ -287,5 +289,5 @@ def emulate(
         for ledger in emulator.ledger.values():
             ledger.write(output / "ledger")
     for name, ledger in emulator.ledger.items():
-        described = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
-        terminal.note(f"{name}: {described or 'nobody listened'}")
+        counts = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
+        terminal.note(f"{name}: {counts or 'nobody listened'}")

@@ -24,11 +24,11 @@ from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
 
-SHOWN = 20  # Maximum number of recordings that are listed; further ones are counted
-# Maximum number of stored bytes to read; further streams are listed with only their number of rows
+SHOWN = 20  # maximum number of recordings that are listed; further ones are counted
+# maximum number of stored bytes to read; further streams are listed with only their number of rows
 READ_BYTES = 1 << 28
-_TRUTH = "gt_"  # Prefix of the simulator's ground-truth labels
-_SPLIT = ("recording", "fold", "role")  # Columns of a split
+_TRUTH = "gt_"  # prefix of the simulator's ground-truth labels
+_SPLIT = ("recording", "fold", "role")  # columns of a split
 
 
 class DatasetOverview(TypedDict):
@@ -86,12 +86,12 @@ def of(path: Path, *, most: int | None = None) -> Shown:
     The kind is recordings, split, model, result or export. The overview of recordings contains labels and each stream's
     figures, for the first ``most`` recordings by name (None: all); only their shards are read, and labels are read on
     access if ``most`` is not None. The overview of a split contains the recordings by fold and role, and that of a
-    model or result the output of `tacpipe.cli.model_overview`.
+    model or result the output of `tacpipe.cli.model_overview`. Raises `UsageError` if there is no dataset.
     """
     stored = manifest_of.find(path)
     store = locate(stored.directory)
     opened = Dataset(stored.manifest, execution.reader(store, (str(stored.directory.absolute()),), stored.manifest))
-    about = _about(opened)
+    about = _common_overview(opened)
     if model_overview.is_result(opened):
         return {"kind": "result", **about, **model_overview.of_result(opened, stored, store)}
     if model_overview.is_model(opened):
@@ -106,18 +106,20 @@ def of(path: Path, *, most: int | None = None) -> Shown:
             "params": params_of.with_current_names(opened.source.stage, opened.source.params),
             "folds": folds,
         }
+    attributes: Mapping[str, Mapping[str, Attribute]] = RecordingAttributes(opened)
+    if most is None:
+        attributes = {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
     return {
         "kind": "recordings",
         **about,
         "recordings": _figures(opened, sorted(opened.recordings)[:most], None if most is None else READ_BYTES),
-        "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
-        if most is None
-        else RecordingAttributes(opened),
+        "attributes": attributes,
         "excluded": _exclusion_reasons(opened),
     }
 
 
-def _about(opened: Dataset) -> DatasetOverview:
+def _common_overview(opened: Dataset) -> DatasetOverview:
+    """Return the entries of an overview that every kind of dataset has."""
     manifest = opened.source
     return {
         "stage": manifest.stage,
@@ -148,24 +150,25 @@ def _exclusion_reasons(opened: Dataset) -> dict[str, str]:
 
 
 def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:
-    """Return each stream's figures by recording, or only its rows once ``most_bytes`` bytes were read in total."""
+    """Return each stream's figures by recording; only its rows once ``most_bytes`` bytes were read (None: no limit)."""
     figures: dict[str, dict[str, StreamFigures]] = {}
+    left_bytes = most_bytes or 0
     for name in names:
         recording = opened.recordings[name]
         figures[name] = {}
         for stream in recording.streams:
             figures[name][stream] = {"rows": recording.rows[stream]}
             if most_bytes is not None:
-                if recording.sizes[stream] > most_bytes:
+                if recording.sizes[stream] > left_bytes:
                     continue
-                most_bytes -= recording.sizes[stream]
+                left_bytes -= recording.sizes[stream]
             columns = recording.columns(stream)
             figures[name][stream] = stream_figures(columns, streams.read_clocks(columns))
     return figures
 
 
 def to_text(value: Shown, *, full: bool = False) -> str:
-    """Return the overview as lines: one per stream of each recording, then labels, files and totals."""
+    """Return the overview as lines, with limited lists unless ``full``: streams of recordings, labels, files and totals."""
     if value["kind"] == "recordings":
         return printable.lines(_recordings_text(value, full))
     lines: list[str] = []
@@ -180,6 +183,7 @@ def to_text(value: Shown, *, full: bool = False) -> str:
 
 
 def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
+    """Return the lines of an overview of recordings: a table of streams, labels, excluded recordings, files, totals."""
     listed_names, count = sorted(value["recordings"]), len(value["attributes"])
     lines = [
         f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
@@ -216,7 +220,7 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
 
 
 def _split_text(value: ShownSplit) -> list[str]:
-    """Return the number of recordings with each role, one line per fold."""
+    """Return the number of recordings with each role, one line per fold, and the split's params."""
     existing = {role for counts in value["folds"].values() for role in counts}
     roles = [*(role for role in ROLES if role in existing), *sorted(existing.difference(ROLES))]
     widths = {role: max(8, len(role) + 2) for role in roles}
@@ -234,7 +238,7 @@ class _Values:
         self._least, self._most = float("inf"), float("-inf")
 
     def add(self, value: Any) -> None:
-        """Add the value of another recording."""
+        """Add the label's value in another recording."""
         if isinstance(value, int | float):
             self._least, self._most = min(self._least, value), max(self._most, value)
         if isinstance(value, float):
@@ -252,7 +256,7 @@ class _Values:
 
 
 def _labels(attributes: Mapping[str, Mapping[str, Attribute]], full: bool) -> list[str]:
-    """Return one line per label with its values, and a single line for all ground-truth labels."""
+    """Return one line per label with its values; unless ``full``, a single line for all ground-truth labels."""
     lines = []
     values_by_label: dict[str, _Values] = {}
     for labels in attributes.values():

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.traces.spans import Span
 
-SAMPLED_ROWS = 1 << 20  # Number of leading rows of a stream in which repeated rows and saturated values are counted
-_LISTED = 6  # Maximum number of listed gaps, spans and events; further ones are counted
-_LABELS = 40  # Maximum number of listed labels of the recording
-_NAMED = 5  # Maximum number of recordings named in an error
+SAMPLED_ROWS = 1 << 20  # number of leading rows of a stream in which repeated rows and saturated values are counted
+_LISTED = 6  # maximum number of listed gaps, spans and events; further ones are counted
+_LABELS = 40  # maximum number of listed labels of the recording
+_NAMED = 5  # maximum number of recordings named in an error
 RATES = "Hz: by the device's counter `seq`, else by the median step, so lost samples do not lower it."
 _MEAN_RATES = (
     "mean Hz: rows per second of the recorded stamps; the labels STREAM_rate_hz are the same on the clock that "
@@ -128,7 +128,7 @@ def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
 
 
 def overview(dataset: Path, name: str) -> RecordingOverview:
-    """Return the contents of a recording. Raises `UsageError` if the dataset has no recording of this name."""
+    """Return the overview of a recording. Raises `UsageError` if the dataset has no recording of this name."""
     from tacpipe.traces import spans
 
     opened = _open(dataset)
@@ -182,6 +182,7 @@ def _open(dataset: Path) -> Dataset:
 
 
 def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
+    """Return a description of each column of a stream; one of a synchronized table has the stream in its metadata."""
     from tacpipe.channels.schema import field_metadata
 
     about = {field.name: field_metadata(field) for field in schema}
@@ -198,11 +199,12 @@ def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
 
 
 def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
-    """Return the time stamps and named columns of a stream with field metadata, or an empty table if none is named."""
+    """Return the timestamps and named columns of a stream with field metadata, or an empty table if none is named."""
     import pyarrow as pa
 
-    names = ["t_ns", *names] if names else []
-    return pa.table([stored.column(name) for name in names], pa.schema([stored.schema.field(name) for name in names]))
+    selected = ["t_ns", *names] if names else []
+    fields = [stored.schema.field(name) for name in selected]
+    return pa.table([stored.column(name) for name in selected], pa.schema(fields))
 
 
 def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
@@ -213,7 +215,7 @@ def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
 
 
 def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFigures:
-    """Return the figures of a stream whose clocks are ``clocks``."""
+    """Return the figures of a stream; ``clocks`` are its clocks, or None if it has no times."""
     import pyarrow as pa
 
     from tacpipe.video.stream import read_format
@@ -258,7 +260,7 @@ def gaps_text(figures: StreamFigures) -> str:
 def _count_repeats_and_limits(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
     """Return the fraction of rows that repeat the previous row, and the number of values at a limit of their type.
 
-    Only the first `SAMPLED_ROWS` rows are read. A missing value does not count as repeated.
+    Only about the first `SAMPLED_ROWS` rows are read. A missing value does not count as repeated.
     """
     import numpy as np
 
@@ -281,7 +283,10 @@ def _count_repeats_and_limits(columns: Columns, names: Sequence[str]) -> tuple[f
 
 
 def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
-    """Return the overview as lines: streams, columns, gaps, row labels, events and labels of the recording."""
+    """Return the overview as lines: streams, columns, gaps, row labels, events and labels of the recording.
+
+    Lists are cut off unless ``full``.
+    """
     rows = sum(figures["rows"] for figures in recording.streams.values())
     head = [shown(recording.name)]
     if recording.duration_s is not None:
@@ -303,6 +308,7 @@ def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
 
 
 def _streams_text(recording: RecordingOverview) -> str:
+    """Return a table with the figures of each stream, and what they mean."""
     heads = ("stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
     rows = []
     for stream, figures in recording.streams.items():
@@ -319,7 +325,7 @@ def _streams_text(recording: RecordingOverview) -> str:
 
 
 def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
-    """Return one line per stream of frames with codec, size, rate and the number of missing frames."""
+    """Return one line per stream of frames with codec, size, rate and the number of missing frames; "" without any."""
     lines = []
     for stream, figures in streams_figures.items():
         if "codec" not in figures:
@@ -334,7 +340,7 @@ def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
 
 
 def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable:
-    """Return a table of columns by stream; adjacent columns that differ only in name share a row."""
+    """Return a table of columns by stream; adjacent columns that differ only in name share a row, unless ``full``."""
     groups = []
     for stream, members in groupby(columns, lambda column: column.stream):
         rows = []
@@ -349,7 +355,7 @@ def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable
 
 
 def _gaps_text(recording: RecordingOverview, full: bool) -> str:
-    """Return one line per stream with gaps: number of gaps, total duration, and the longest gaps."""
+    """Return one line per stream with gaps: number of gaps, total duration, and the longest gaps; "" without gaps."""
     lines = []
     for stream in sorted({gap.name for gap in recording.gaps}):
         longest = sorted(
@@ -360,12 +366,13 @@ def _gaps_text(recording: RecordingOverview, full: bool) -> str:
         share = f" ({total_s / recording.duration_s:.1%})" if recording.duration_s else ""
         places = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
         lines.append(
-            f"{plain(stream)}: {format_count(len(places), 'gaps')}, {total_s:.3f} s{share}: {_first(places, full)}"
+            f"{plain(stream)}: {format_count(len(places), 'gaps')}, {total_s:.3f} s{share}: {_list_first(places, full)}"
         )
     return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
 
 
 def _intervals_text(label_spans: Sequence[ShownInterval], full: bool) -> str:
+    """Return one line per label of rows with its spans; "" without such labels."""
     lines = []
     for label in dict.fromkeys(span.name for span in label_spans):
         places = [
@@ -373,7 +380,7 @@ def _intervals_text(label_spans: Sequence[ShownInterval], full: bool) -> str:
             for span in label_spans
             if span.name == label
         ]
-        lines.append(f"{label}: {_first(places, full)}")
+        lines.append(f"{label}: {_list_first(places, full)}")
     return "\n".join(["labels of rows", *(f"  {shown(line)}" for line in lines)]) if lines else ""
 
 
@@ -384,15 +391,15 @@ def _events_text(events: Sequence[RecordedEvent], full: bool) -> str:
     return "\n".join(["events", *retained, *ending]) if lines else ""
 
 
-def _first(places: Sequence[str], full: bool) -> str:
-    return (
-        "; ".join(places)
-        if full or len(places) <= _LISTED
-        else f"{'; '.join(places[:_LISTED])}; and {len(places) - _LISTED} more"
-    )
+def _list_first(texts: Sequence[str], full: bool) -> str:
+    """Return the texts joined, only the first ones and the number of others if there are many, unless ``full``."""
+    if full or len(texts) <= _LISTED:
+        return "; ".join(texts)
+    return f"{'; '.join(texts[:_LISTED])}; and {len(texts) - _LISTED} more"
 
 
 def _attributes_text(attributes: Mapping[str, Attribute], full: bool) -> str:
+    """Return one line per label of the recording, without ground truth and only the first ones unless ``full``."""
     names = sorted(attributes)
     listed_names = names if full else [name for name in names if not name.startswith(streams.TRUTH)][:_LABELS]
     lines = [f"  {shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]

@@ -20,7 +20,7 @@ from tacpipe.plugins.stage import AnyStage, Requirements
 from tacpipe.training.devices import Device
 
 PRINT_PARAMS = "--print-params"
-EXAMPLE = "Example: "  # Start of the last paragraph of a stage's docstring
+EXAMPLE = "Example: "  # start of the last paragraph of a stage's docstring
 
 
 def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
@@ -29,6 +29,7 @@ def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parame
 
 
 def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
+    """Return the positional arguments of a stage's command: source, model and datasets, as far as the stage reads them."""
     kinds = set(stage.arguments.values())
     default = None if PRINT_PARAMS in sys.argv else ...  # Printing params requires no data.
     arguments: list[tuple[str, Any, str]] = []
@@ -42,6 +43,7 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
 
 
 def _shared_parameters(stage: AnyStage) -> list[inspect.Parameter]:
+    """Return the options for the output and for the other datasets and services that a stage uses."""
     output = typer.Option(None, "-o", "--output", help="Directory to write.", rich_help_panel=REQUIRED)
     parameters = [_parameter("output", Path | None, output)]
     if stage.reads_split:
@@ -90,6 +92,7 @@ def _shared_parameters(stage: AnyStage) -> list[inspect.Parameter]:
 
 
 def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
+    """Return an option for each param of a stage, and the options of params files, execution and printing."""
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     panels = params_of.panels(stage)
     choice = _shown_choice(stage)
@@ -100,7 +103,11 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
         flag = f"--{name.replace('_', '-')}"
         flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
         # Option values are parsed like those of --set.
-        annotation = bool | None if kind is bool else list[str] | None if is_sequence else str | None
+        annotation: Any = str | None
+        if kind is bool:
+            annotation = bool | None
+        elif is_sequence:
+            annotation = list[str] | None
         text = _about(stage, name, helps.get(name, ""))
         metavar = None if kind is bool else _metavar(hint)
         owners = params_of.choices_with(stage, name)
@@ -170,7 +177,7 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
 
 
 def _looks(stage: AnyStage) -> list[inspect.Parameter]:
-    """Return the options that only print information."""
+    """Return the options that print information instead of running the stage."""
     parameters = []
     if stage.guess is not None:
         text = "Print a first layout file for this folder, and stop."
@@ -180,12 +187,14 @@ def _looks(stage: AnyStage) -> list[inspect.Parameter]:
         parameters.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
     if stage.requirements is not None:
         text = "Print the required channels and labels, and stop."
-        show = typer.Option(False, "--requirements", help=text, is_eager=True, callback=_shows(stage.requirements))
+        show = typer.Option(
+            False, "--requirements", help=text, is_eager=True, callback=_requirements_callback(stage.requirements)
+        )
         parameters.append(_parameter("requirements", bool, show))
     return parameters
 
 
-def _shows(requirements: Requirements) -> Callable[[bool], None]:
+def _requirements_callback(requirements: Requirements) -> Callable[[bool], None]:
     """Return a callback that prints the requirements of a task before missing arguments are reported."""
 
     def show(requested: bool) -> None:
@@ -197,13 +206,13 @@ def _shows(requirements: Requirements) -> Callable[[bool], None]:
 
 
 def _shown_choice(stage: AnyStage) -> str | None:
-    """Return the architecture (or other kind of params) whose options are shown in the help."""
+    """Return the architecture (or other kind of params) whose options the help shows; None if a stage has only one kind."""
     tag = params_of.tag(stage)
     if tag is None:
         return None
-    for word, following in zip(sys.argv, [*sys.argv[1:], ""], strict=True):
+    for word, next_word in zip(sys.argv, [*sys.argv[1:], ""], strict=True):
         if word == f"--{tag}":
-            return following
+            return next_word
         if word.startswith(f"--{tag}="):
             return word.partition("=")[2]
     return str(params_of.defaults(stage, tag)[0])
@@ -220,11 +229,13 @@ def _about(stage: AnyStage, name: str, comment: str) -> str:
         parts.append(f"only with {tag} {', '.join(owners)}")
     if name == tag and any(params_of.choices_with(stage, field) for field in params_of.fields(stage)):
         parts.append(f"--{tag} NAME --help shows the options of NAME")
-    defaults = [_default(name, value) for value in params_of.defaults(stage, name) if value not in (None, "", ())]
+    defaults = [
+        _format_default(name, value) for value in params_of.defaults(stage, name) if value not in (None, "", ())
+    ]
     return "; ".join(parts) + (f" [default: {' or '.join(defaults)}]" if defaults else "")
 
 
-def _default(name: str, value: Any) -> str:
+def _format_default(name: str, value: Any) -> str:
     """Return a default in the syntax of the option."""
     if isinstance(value, bool):
         return ("" if value else "no-") + name.replace("_", "-")
@@ -248,7 +259,7 @@ def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 
 
 def summary(name: str, stage: AnyStage) -> str:
-    """Return a stage's docstring, which is that of its module if the module is named after the stage, or of its function.
+    """Return a stage's docstring: its module's if the module is named after the stage, else its function's.
 
     The last paragraph is an example, generated from the stage's arguments if the docstring has none.
     """

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext
     from multiprocessing.context import ForkServerProcess as Process
 
-Command = str | Sequence[str]  # Shell command line, or arguments of a tacpipe command without ``tacpipe``
+Command = str | Sequence[str]  # shell command line, or arguments of a tacpipe command without ``tacpipe``
 OWN = (
     "tacpipe.cli.main",
     "tacpipe.cli.commands",
@@ -35,20 +35,20 @@ OWN = (
     "tacpipe.engine.pipeline",
     "tacpipe.io.parquet",
 )
-OTHERS = ("yaml", "pydantic.type_adapter", "pandas")  # Imported by params, typer and pyarrow's conversion of columns
+OTHERS = ("yaml", "pydantic.type_adapter", "pandas")  # imported by params, typer and pyarrow's conversion of columns
 MODULES = OWN + OTHERS
 LEARNING = ("torch", "tacpipe.training.loop")
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
 
 
 def modules(commands: Iterable[str]) -> tuple[str, ...]:
-    """Return the modules that the commands import.
+    """Return the modules that processes import before they run the commands.
 
     >>> modules(["tacpipe split data -o split"]) == MODULES
     True
     """
-    learning = any(_LEARNS.search(command) for command in commands)
-    return (*MODULES, *LEARNING) if learning else MODULES
+    any_learns = any(_LEARNS.search(command) for command in commands)
+    return (*MODULES, *LEARNING) if any_learns else MODULES
 
 
 class StageProcesses:
@@ -90,7 +90,10 @@ class StageProcesses:
         return bool(self._running)
 
     def start(self, name: str, command: Command, together: int) -> None:
-        """Start a command of stage ``name``, which must not be running; ``together`` commands divide the cores."""
+        """Start a command of stage ``name``, which must not be running; ``together`` commands divide the cores.
+
+        A GPU is selected by the stage's slot.
+        """
         if self._context is None:
             with provenance.shared_by(self.jobs):  # The forking process passes on its environment.
                 self._context = local.start_fork_server(self._modules)
@@ -117,6 +120,7 @@ class StageProcesses:
         return [name for name, process in self._running.items() if process.sentinel in ready]
 
     def _collect_stage(self, name: str) -> int:
+        """Wait for the process of a stage, write its output to stdout and stderr, and return its exit code."""
         process = self._running.pop(name)
         process.join()
         for path, stream in zip(self._output_paths(self._slots.pop(name)), (sys.stdout, sys.stderr), strict=True):
@@ -132,14 +136,14 @@ class StageProcesses:
         return self._folder / f"{slot}.out", self._folder / f"{slot}.err"
 
 
-def _run(command: str | list[str], place: str, variables: dict[str, str], *output_paths: str) -> None:
-    """Run one command in this forked process."""
+def _run(command: str | list[str], folder: str, variables: dict[str, str], *output_paths: str) -> None:
+    """Run one command in this forked process, in the folder ``place``, with its output in the files ``output_paths``."""
     os.environ.update(variables)
-    for handle, path in enumerate(output_paths, 1):
-        opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
-        os.dup2(opened, handle)
-        os.close(opened)
-    os.chdir(place)
+    for target, path in enumerate(output_paths, 1):
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+        os.dup2(descriptor, target)
+        os.close(descriptor)
+    os.chdir(folder)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     if isinstance(command, str):
         os.execv("/bin/sh", ["sh", "-c", command])

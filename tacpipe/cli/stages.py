@@ -62,7 +62,7 @@ def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> Non
 
 
 def add(program: typer.Typer, name: str, command: str) -> None:
-    """Add stage ``name`` to ``program`` as ``command``."""
+    """Add stage ``name`` to ``program`` as ``command``, with options for its params."""
     stage = registry.load(name)
     fields = params_of.fields(stage)
     parameters = stage_options.of(stage, fields)
@@ -76,8 +76,13 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 
 
 def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequence[str]) -> None:
+    """Run a stage with the options of its command: print information, or compute one or several folds and report them.
+
+    Raises `UnansweredError` while only stored results are reported and there are none, and `UsageError` for wrong
+    options.
+    """
     answering = _answering.get()
-    if answering and any(options.get(look) for look in ("guess", "print_params", "dry_run")):
+    if answering and any(options.get(flag) for flag in ("guess", "print_params", "dry_run")):
         raise UnansweredError
     terminal.set_quiet(options["quiet"])
     for flag, kind in OPTIONS.items():
@@ -115,7 +120,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         _report(pipeline.run(requests[0]), headline_file, **report_options)
     else:
         if stage.trains and not (options["quiet"] or options["check"] or options["compare"]):
-            _estimate(requests)
+            _print_estimate(requests)
         _run_folds(requests, headline_file, **report_options)
 
 
@@ -150,7 +155,7 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
         _report(outcome, headline, as_json=as_json, quiet=quiet)
 
 
-def _estimate(requests: Sequence[Request]) -> None:
+def _print_estimate(requests: Sequence[Request]) -> None:
     """Print the estimated training time of the missing models, if there is an estimate."""
     from tacpipe.engine import grid
 
@@ -163,19 +168,20 @@ def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bo
     """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end if any fold failed."""
     from tacpipe.engine import by_recording, grid
 
-    failed: list[TacpipeError] = []
+    errors: list[TacpipeError] = []
     for request, result in grid.run(requests, requests[0].jobs):
         if isinstance(result, TacpipeError):
-            failed.append(result)
+            errors.append(result)
             terminal.note(f"tacpipe: fold {request.fold}: {result}")
         else:
             _report(result, headline, as_json=as_json, quiet=quiet)
-    if failed:
-        message = f"{len(failed)} of {len(requests)} folds failed; the others are written."
-        raise by_recording.error(max(error.exit_code for error in failed), message)
+    if errors:
+        message = f"{len(errors)} of {len(requests)} folds failed; the others are written."
+        raise by_recording.error(max(error.exit_code for error in errors), message)
 
 
 def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
+    """Print an outcome: notes, left-out recordings, headlines, and the output's path or JSON. Exits if results differ."""
     for note in outcome.notes:
         terminal.note(f"tacpipe: {note}")
     for line in printable.grouped_failures(outcome.bad):

@@ -165,7 +165,7 @@ def repair(as_json: AsJson = False) -> None:
 
 
 def _exit_if_unread(soundness: Soundness) -> None:
-    """Exit with 1 if the system failed to read objects, whose state is therefore unknown."""
+    """Exit with 1 if the system failed to read objects or records, whose state is therefore unknown."""
     if soundness.unread:
         terminal.report_progress(
             f"{len(soundness.unread)} objects or records could not be read: {next(iter(soundness.unread.values()))}"
@@ -220,6 +220,10 @@ def gc(
 def _collect_distant(
     store: Store, forget: list[str], dry_run: bool, recordings: bool, grace_days: float, *, cache: bool
 ) -> garbage.Collected:
+    """Remove what is not needed in a bucket, or with ``cache`` only local copies.
+
+    Raises `UsageError` for other options then.
+    """
     from tacpipe.maintenance import cache as caches
 
     distant = caches.distant(store)
@@ -232,6 +236,10 @@ def _collect_distant(
 
 
 def _forget(store: AnyStore, names: list[str], *, dry_run: bool) -> None:
+    """Remove the roots of pushed or deleted datasets; with ``dry_run`` only check them.
+
+    Raises `UsageError` if the store keeps no such dataset.
+    """
     from tacpipe.maintenance import pushed
 
     for name in names:
@@ -307,6 +315,7 @@ def pull(
 
 
 def _describe_transfer(verb: str, transferred: Any) -> str:
+    """Return a sentence on a transfer, such as "pushed A: 3 objects (1.0 MB); 2 were there already"."""
     names = plain(", ".join(transferred.datasets), 1000)
     text = (
         f"{verb} {names}: {transferred.objects} objects ({transferred.bytes / 1e6:.1f} MB); "

@@ -23,7 +23,7 @@ EXAMPLE = (
     "several recordings. Nothing is sent over the network."
     "\n\nExample: tacpipe view data/recordings trial-003 --predictions data/predictions"
 )
-MAGIC, ENDING = b"RRF", ".rrd"  # First bytes and suffix of a Rerun file
+MAGIC, ENDING = b"RRF", ".rrd"  # first bytes and suffix of a Rerun file
 LIMIT = 8
 
 
@@ -128,6 +128,7 @@ def conditions(where: Sequence[str]) -> dict[str, Attribute]:
 def _select_recordings(
     path: Path, names: Sequence[str], label_texts: Sequence[str], split: Path | None, role: str | None, fold: int
 ) -> Dataset:
+    """Return the recordings that the options select. Raises `UsageError` if the dataset has none."""
     import tacpipe
 
     required_labels = conditions(label_texts)
@@ -140,7 +141,10 @@ def _select_recordings(
 def _collect_contents(
     recordings: Sequence[Recording], predictions: Dataset | None, videos: Dataset | None
 ) -> Iterator[DrawnContents]:
-    """Yield the contents of each recording. Raises `UsageError` for a recording with nothing to draw."""
+    """Yield the contents of each recording, with a note if its predictions or video are missing.
+
+    Raises `UsageError` for a recording with nothing to draw.
+    """
     from tacpipe.viewer import contents
 
     for recording in recordings:
@@ -169,7 +173,7 @@ def _opened(path: Path | None) -> Dataset | None:
 
 
 def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
-    """Return the predictions for a recording: its own table, or its one-row slice of a table of all recordings."""
+    """Return a recording's predictions: its own table, and its row in a table of all recordings, or None for each."""
     if name in predictions:
         return predictions[name].table(), None
     for recording in predictions:
@@ -184,20 +188,24 @@ def predicted(predictions: Dataset, name: str) -> tuple[Any, Any]:
 
 
 def _save(files: Sequence[Path], save: Path) -> None:
-    """Write a single file to ``save``, or several into the folder ``save``, without overwriting files of other programs."""
+    """Write a single file to ``save``, or several into the folder ``save``.
+
+    Raises `UsageError` for files of other programs.
+    """
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
 
-    places = [save] if save.suffix.lower() == ENDING else [save / file.name for file in files]
-    for place in places:
-        replacing.refuse_foreign(place, MAGIC)
+    paths = [save] if save.suffix.lower() == ENDING else [save / file.name for file in files]
+    for path in paths:
+        replacing.refuse_foreign(path, MAGIC)
     with readable_errors(save.parent):
-        for file, place in zip(files, places, strict=True):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(str(place), file.read_bytes(), f"{place}.draft")
+        for file, path in zip(files, paths, strict=True):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(str(path), file.read_bytes(), f"{path}.draft")
 
 
 def _show_in_window(files: Sequence[Path]) -> None:
+    """Show the files in the viewer's window until it is closed. Raises `TacpipeError` if the viewer fails."""
     from tacpipe.viewer import session
 
     terminal.note("The viewer is open; close it or press Ctrl-C to end.")
@@ -210,6 +218,7 @@ def _show_in_window(files: Sequence[Path]) -> None:
 
 
 def _show_in_browser(files: Sequence[Path], port: int | None) -> None:
+    """Serve the files to a browser on this computer, and open it, until Ctrl-C. Raises the errors of `serve`."""
     import time
     import webbrowser
 
@@ -218,6 +227,6 @@ def _show_in_browser(files: Sequence[Path], port: int | None) -> None:
     with serve(files, port) as address:
         terminal.result(address)
         webbrowser.open(address)
-        terminal.note("The viewer is serve on this computer; press Ctrl-C to end.")
+        terminal.note("The viewer is served on this computer; press Ctrl-C to end.")
         while True:
             time.sleep(1)
