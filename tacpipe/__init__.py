@@ -57,7 +57,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of the API on first access, so that ``import tacpipe`` is fast."""
+    """Import a name of the API on first access, so that ``import tacpipe`` is fast.
+
+    Raises ``AttributeError`` for others.
+    """
     if name in ("Dataset", "Recording"):
         from tacpipe.datasets import dataset
 

@@ -38,7 +38,7 @@ def from_arrow(column: pa.Array | pa.ChunkedArray) -> AnyArray:
     import pyarrow as pa
 
     if column.null_count or not (is_numeric(column) or pa.types.is_boolean(column.type)):
-        return _converted(column)
+        return _convert_with_pyarrow(column)
     chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     pieces = [_view(chunk) for chunk in chunks if len(chunk)]
     if len(pieces) == 1:
@@ -62,7 +62,8 @@ def is_numeric(column: pa.Array | pa.ChunkedArray) -> bool:
     return (kinds.is_integer(column.type) or kinds.is_floating(column.type)) and not column.null_count
 
 
-def _converted(column: pa.Array | pa.ChunkedArray) -> AnyArray:
+def _convert_with_pyarrow(column: pa.Array | pa.ChunkedArray) -> AnyArray:
+    """Return the values of a column as pyarrow converts them, with missing values."""
     import pyarrow as pa
 
     values: AnyArray = (

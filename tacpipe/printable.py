@@ -50,7 +50,7 @@ def listed(names: Iterable[object], max_names: int = 8) -> str:
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """Return a sentence, with a space before it, that asks for the most similar of ``names``; the empty text for none.
+    """Return a sentence, with a space before it, that suggests the most similar of ``names``; "" if none is similar.
 
     >>> suggestion("materail", ["sensor", "material"]), suggestion("xyz", ["sensor"])
     (' Did you mean material?', '')
@@ -89,15 +89,15 @@ def shown(text: str) -> str:
 
 
 def moment(t_ns: int) -> str:
-    """Return a stamp as a date in UTC where it counts from 1970, else as seconds.
+    """Return a timestamp as a date in UTC if it counts from 1970, else as seconds.
 
     >>> moment(1_396_293_889_366_115_136), moment(2_500_000_000)
     ('2014-03-31 19:24:49.366 UTC', '2.500 s')
     """
     if t_ns < WALL_CLOCK_NS:
         return f"{t_ns / 1e9:.3f} s"
-    at = datetime.fromtimestamp(t_ns // 10**9, UTC)
-    return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 10**6 % 1000:03d} UTC"
+    date = datetime.fromtimestamp(t_ns // 10**9, UTC)
+    return f"{date:%Y-%m-%d %H:%M:%S}.{t_ns // 10**6 % 1000:03d} UTC"
 
 
 def lines(texts: Iterable[str]) -> str:
@@ -106,7 +106,7 @@ def lines(texts: Iterable[str]) -> str:
 
 
 def padded(text: str, width: int) -> str:
-    """Return ``text`` with spaces behind it, to so many cells of a terminal.
+    """Return ``text`` with spaces after it, ``width`` cells of a terminal wide.
 
     >>> padded("木", 4), padded("cup", 4)
     ('木  ', 'cup ')

@@ -44,8 +44,8 @@ def shared_name(field: pa.Field) -> str:
     declared, name = (field.metadata or {}).get(b"component", b"").decode(), str(field.name)
     if declared and name.endswith(declared):
         return name.removesuffix(declared)
-    part, shared = split_name(name)
-    return shared if part or declared else ""
+    own_component, rest = split_name(name)
+    return rest if own_component or declared else ""
 
 
 POSITION, ORIENTATION, WIDTH = "position", "orientation", "finger_width"  # quantities
@@ -142,7 +142,7 @@ def missing_arm_error(recording: str, schema: pa.Schema) -> TacpipeError:
 
 
 def _vectors(schema: pa.Schema, quantity: str) -> dict[tuple[str, str], list[pa.Field]]:
-    """Return the columns of a quantity by stream and common part of their names."""
+    """Return the columns of a quantity by stream and common part of their names, without ground truth."""
     fields_by_vector: dict[tuple[str, str], list[pa.Field]] = {}
     for field in schema:
         metadata = field.metadata or {}
@@ -153,7 +153,7 @@ def _vectors(schema: pa.Schema, quantity: str) -> dict[tuple[str, str], list[pa.
 
 
 def _order_components(fields: list[pa.Field], parts: str, quantity: str, stream: str) -> tuple[str, ...]:
-    """Return the names of columns in the order of ``parts``, each of which must occur once."""
+    """Return the names of columns in the order of ``parts``. Raises `TacpipeError` unless each occurs once."""
     by_part = {component(field): field.name for field in fields}
     if sorted(by_part) != sorted(parts) or len(fields) != len(parts):
         raise TacpipeError(
@@ -210,10 +210,10 @@ def path_speed(streams: Mapping[str, pa.Table | Columns]) -> tuple[Times, Floats
     from tacpipe.signals import kinematics
 
     for table in streams.values():
-        names = columns_with_quantity(table, "position")
-        if names and table.num_rows > 1:
-            scale = np.array([metres_per_unit(table.schema.field(name)) for name in names])
-            position_m = np.column_stack([table.column(name).to_numpy() for name in names]) * scale
+        position_columns = columns_with_quantity(table, "position")
+        if position_columns and table.num_rows > 1:
+            scale = np.array([metres_per_unit(table.schema.field(name)) for name in position_columns])
+            position_m = np.column_stack([table.column(name).to_numpy() for name in position_columns]) * scale
             t_ns = table.column("t_ns").to_numpy()
             return t_ns, kinematics.path_speed(t_ns, position_m)
     return None
@@ -241,4 +241,6 @@ def speed(streams: Mapping[str, pa.Table | Columns]) -> tuple[Times, Floats] | N
         if kinematics.carries_hand(iiwa, joint_rad, hand_m):
             hand_m_s = kinematics.hand_velocity(iiwa, joint_rad, joint_rad_s, hand_m)[:, :3]
             return at_ns, np.linalg.norm(hand_m_s, axis=1)
-    return None if velocity is None else (velocity[0], np.linalg.norm(velocity[1][:, :3], axis=1))
+    if velocity is None:
+        return None
+    return velocity[0], np.linalg.norm(velocity[1][:, :3], axis=1)

@@ -101,13 +101,11 @@ def fields() -> list[pa.Field]:
     quantities = {f"electrode{n:02d}": "tactile" for n in range(1, ELECTRODES + 1)}
     quantities |= {"pac0": "vibration", "pac1": "vibration", "pdc": "static_pressure"}
     quantities |= {"tac": "temperature_change", "tdc": "temperature"}
-    return [
-        pa.field(
-            f"{finger}_{name}",
-            pa.uint16(),
-            metadata={"unit": "count", "quantity": quantity, "finger": finger}
-            | ({"electrode": str(int(name.removeprefix("electrode")))} if quantity == "tactile" else {}),
-        )
-        for finger in FINGERS
-        for name, quantity in quantities.items()
-    ]
+    finger_fields = []
+    for finger in FINGERS:
+        for name, quantity in quantities.items():
+            metadata = {"unit": "count", "quantity": quantity, "finger": finger}
+            if quantity == "tactile":
+                metadata["electrode"] = str(int(name.removeprefix("electrode")))
+            finger_fields.append(pa.field(f"{finger}_{name}", pa.uint16(), metadata=metadata))
+    return finger_fields

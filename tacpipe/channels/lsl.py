@@ -121,7 +121,7 @@ def parse(text: str | bytes) -> LslDescription:
 
 
 def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[LslChannel, ...]:
-    """Return ``count`` channels: the described ones if their number matches, else numbered ones."""
+    """Return ``count`` channels: the described ones if their number matches, else numbered ones; ``text`` for texts."""
     labels = [element.findtext("label", "").strip() for element in described] if len(described) == count else []
     if not all(labels) or not labels:
         digits = max(2, len(str(count)))
@@ -155,12 +155,20 @@ def _quantity(type_text: str, kind: str, label: str) -> tuple[str, str]:
         return QUANTITIES[match[1].lower()], match[2].lower()
     quantity = QUANTITIES.get(type_text.strip().lower()) or QUANTITIES.get(kind.strip().lower(), "")
     match = COMPONENT.fullmatch(label.strip())
-    vector = quantity in ("force", "torque", "position", "orientation", "velocity", "acceleration", "angular_velocity")
-    return quantity, match[2].lower() if match and vector else ""
+    is_vector = quantity in (
+        "force",
+        "torque",
+        "position",
+        "orientation",
+        "velocity",
+        "acceleration",
+        "angular_velocity",
+    )
+    return quantity, (match[2].lower() if match and is_vector else "")
 
 
 def nanoseconds(seconds: Floats) -> Int64s:
-    """Convert LSL's seconds to integer nanoseconds. Integer and fractional parts are converted separately for precision.
+    """Return LSL's seconds as integer nanoseconds; integer and fractional parts are converted separately for precision.
 
     >>> nanoseconds(np.array([1.5, 41037.236252649])).tolist()
     [1500000000, 41037236252649]

@@ -111,15 +111,16 @@ def taxel_positions(fields: Sequence[pa.Field]) -> tuple[Floats, str]:
 
 
 def _sensor_layout(metadata: Sequence[dict[str, str]]) -> tuple[Floats, list[int]] | None:
-    """Return the layout of a known sensor and the number of each taxel, from 1, or None for an unknown sensor."""
+    """Return the layout of a known sensor (taxel, axis) in metres and the number of each taxel, from 1, or None."""
     if all("electrode" in entry for entry in metadata):
         if len(metadata) == biotac_sp.ELECTRODES:
             return biotac_sp.unrolled_positions_m()[:, ::-1], _numbers(metadata, "electrode")  # the tip is at the top
         return unroll_m(BIOTAC_M)[:, ::-1], _numbers(metadata, "electrode")
     if all("triangle" in entry and "taxel" in entry for entry in metadata):
         pairs = zip(_numbers(metadata, "triangle"), _numbers(metadata, "taxel"), strict=True)
-        complete = len(metadata) == schema.TRIANGLES * schema.TRIANGLE_TAXELS
-        return (roboskin_m(), [(t - 1) * schema.TRIANGLE_TAXELS + n for t, n in pairs]) if complete else None
+        if len(metadata) != schema.TRIANGLES * schema.TRIANGLE_TAXELS:
+            return None
+        return roboskin_m(), [(triangle - 1) * schema.TRIANGLE_TAXELS + taxel for triangle, taxel in pairs]
     if len(metadata) == schema.TAXELS and all("taxel" in entry for entry in metadata):
         return uskin_m(), _numbers(metadata, "taxel")
     return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,8 +54,7 @@ def uskin_fields(taxels: int = TAXELS) -> list[pa.Field]:
             pa.uint16(),
             metadata={"unit": "count", "quantity": "tactile", "taxel": str(taxel), "axis": axis},
         )
-        for taxel in range(1, taxels + 1)
-        for axis in AXES
+        for taxel, axis in product(range(1, taxels + 1), AXES)
     ]
 
 
@@ -91,8 +91,7 @@ def roboskin_fields() -> list[pa.Field]:
             pa.float32(),
             metadata={"unit": "count", "quantity": "tactile", "triangle": str(triangle), "taxel": str(taxel)},
         )
-        for triangle in range(1, TRIANGLES + 1)
-        for taxel in range(1, TRIANGLE_TAXELS + 1)
+        for triangle, taxel in product(range(1, TRIANGLES + 1), range(1, TRIANGLE_TAXELS + 1))
     ]
 
 
@@ -137,11 +136,11 @@ def pose_fields() -> list[pa.Field]:
 
 def target_pose_fields() -> list[pa.Field]:
     """Return the fields of the target pose of an arm's controller: ``target_position_x_m``, … ``target_orientation_w``."""
-    return [
-        float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
-        for field in pose_fields()
-        for kind, part in [(field.name.split("_")[0], field.name.split("_")[1])]
-    ]
+    fields = []
+    for field in pose_fields():
+        kind, part, *_ = field.name.split("_")
+        fields.append(float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part))
+    return fields
 
 
 def float_field(name: str, unit: str, quantity: str, component: str | None = None) -> pa.Field:
@@ -248,8 +247,8 @@ def unit_from_text(text: str) -> str:
     >>> unit_from_text("Newton"), unit_from_text(" counts"), unit_from_text("mm"), unit_from_text("left")
     ('N', 'count', 'mm', '')
     """
-    text = text.strip()
-    return ALIASES.get(text.lower()) or (text if is_unit(text) else "")
+    stripped = text.strip()
+    return ALIASES.get(stripped.lower()) or (stripped if is_unit(stripped) else "")
 
 
 def describe_unknown_quantity(word: str, declared: Collection[str] = ()) -> str:

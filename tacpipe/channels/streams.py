@@ -52,17 +52,21 @@ def read_clocks(columns: Columns) -> Clocks | None:
         return None
     pieces = (piece for piece in columns.batches(names, _PIECE_ROWS) if piece.num_rows)
     piece = next(pieces)
-    first_row, rate, median_ns = piece.slice(0, 1), rate_hz(piece), float(np.median(np.diff(piece["t_ns"].to_numpy())))
+    first_row, rate, median_step_ns = (
+        piece.slice(0, 1),
+        rate_hz(piece),
+        float(np.median(np.diff(piece["t_ns"].to_numpy()))),
+    )
     starts_ns, stops_ns = [], []
     while True:
-        t_ns, rows = piece["t_ns"].to_numpy(), gaps_before(piece, median_ns)
+        t_ns, rows = piece["t_ns"].to_numpy(), gaps_before(piece, median_step_ns)
         starts_ns.append(t_ns[rows - 1])
         stops_ns.append(t_ns[rows])
         last_row = piece.slice(piece.num_rows - 1)
-        following = next(pieces, None)
-        if following is None:
+        next_piece = next(pieces, None)
+        if next_piece is None:
             break
-        piece = pa.concat_tables([last_row, following])
+        piece = pa.concat_tables([last_row, next_piece])
     ends = pa.concat_tables([first_row, last_row])
     start_ns, stop_ns = ends["t_ns"].to_pylist()
     rate = rate_hz(ends) if "seq" in names else rate
@@ -81,8 +85,8 @@ def rate_hz(table: pa.Table | Columns) -> float | None:
     step_ns = np.diff(table.column("t_ns").to_numpy())  # (time - 1,)
     if "seq" in table.column_names and step_ns.sum() > 0:  # with a sample counter, late arrivals are not gaps
         return round(float(np.diff(table.column("seq").to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
-    median_ns = float(np.median(step_ns))
-    return round(1e9 / median_ns, 3) if median_ns else None
+    median_step_ns = float(np.median(step_ns))
+    return round(1e9 / median_step_ns, 3) if median_step_ns else None
 
 
 def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
@@ -194,25 +198,27 @@ def finger_stream(name: str, streams: Mapping[str, Table]) -> Table:
 def remove_spikes(
     table: pa.Table, rows: int, deviations: float, floor_count: float, names: Sequence[str] | None = None
 ) -> tuple[pa.Table, Int64s]:
-    """Repair spikes in the tactile channels of a stream with `hampel`; also return their number in each row (time,).
+    """Return a stream without spikes in its tactile channels, repaired with `hampel`, and their number in each row (time,).
 
-    By default, all tactile channels are repaired, otherwise only ``names``.
+    By default, all tactile channels are repaired, otherwise only ``names``. A spike deviates from the median of
+    ``rows`` rows by more than ``deviations``, at least ``floor_count``.
     """
     import numpy as np
     import pyarrow as pa
 
     from tacpipe.signals.repairs import hampel
 
-    names = columns_with_quantity(table, "tactile") if names is None else list(names)
-    if not names:
+    repairable = columns_with_quantity(table, "tactile") if names is None else list(names)
+    if not repairable:
         return table, np.zeros(table.num_rows, np.int64)
-    values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
+    values = np.column_stack([table.column(name).to_numpy() for name in repairable])  # (time, channel)
     spikes, repaired = hampel(values, rows, deviations, floor_count)
+    repaired_table = table
     for channel in np.flatnonzero(spikes.any(axis=0)):
-        field = table.schema.field(names[channel])
+        field = table.schema.field(repairable[channel])
         column = pa.array(repaired[:, channel].copy(), field.type)
-        table = table.set_column(table.column_names.index(field.name), field, column)
-    return table, spikes.sum(axis=1)
+        repaired_table = repaired_table.set_column(table.column_names.index(field.name), field, column)
+    return repaired_table, spikes.sum(axis=1)
 
 
 GRID = "grid"  # attribute of synchronized recordings: uniform, logged or fresh

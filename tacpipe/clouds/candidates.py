@@ -85,13 +85,13 @@ def candidates(
     inside it, or no cut fits between the fingers; `UsageError` if an argument is out of range.
     """
     _validate_arguments(count, shift, opening_m)
-    cloud = _subsample(cloud, seed)
-    frame = _frame(cloud, camera_m)
-    cuts = _Cuts(cloud, frame, camera_m, opening_m)
+    sampled = _subsample(cloud, seed)
+    frame = _frame(sampled, camera_m)
+    cuts = _Cuts(sampled, frame, camera_m, opening_m)
     bounds = np.linspace(-shift, shift, count + 1) * frame.length_m
-    draws = np.random.default_rng(seed).uniform(size=(count, TRIES))
+    cut_positions = np.random.default_rng(seed).uniform(size=(count, TRIES))
     chosen = []
-    for low, high, fractions in zip(bounds[:-1], bounds[1:], draws, strict=True):
+    for low, high, fractions in zip(bounds[:-1], bounds[1:], cut_positions, strict=True):
         tried = [cuts.best(low + fraction * (high - low)) for fraction in (fractions if shift else fractions[:1])]
         feasible = [candidate for candidate in tried if candidate is not None]
         if feasible:
@@ -104,6 +104,7 @@ def candidates(
 
 
 def _validate_arguments(count: int, shift: float, opening_m: tuple[float, float]) -> None:
+    """Raise `UsageError` if an argument of `candidates` is out of range."""
     if count < 1:
         raise UsageError(f"{count} candidates are requested; the number must be 1 or more.")
     if not 0 <= shift <= 0.5:
@@ -116,6 +117,7 @@ def _validate_arguments(count: int, shift: float, opening_m: tuple[float, float]
 
 
 def _explain_no_grasp(widths_m: list[float], opening_m: tuple[float, float]) -> str:
+    """Return why no cut has a candidate: no cut has enough points, or all are too wide or narrow for the fingers."""
     limits = f"{opening_m[0] * 1e3:g} to {opening_m[1] * 1e3:g} mm"
     if not widths_m:
         return (
@@ -129,6 +131,7 @@ def _explain_no_grasp(widths_m: list[float], opening_m: tuple[float, float]) -> 
 
 
 def _subsample(cloud: Cloud, seed: int) -> Cloud:
+    """Return a cloud, or random points of a large one. Raises `TacpipeError` if it has too few points."""
     if len(cloud) < MIN_POINTS:
         raise TacpipeError(
             f"The cloud has {len(cloud)} points; {MIN_POINTS} or more are needed. Is it the object's cloud?"
@@ -140,11 +143,15 @@ def _subsample(cloud: Cloud, seed: int) -> Cloud:
 
 
 def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
+    """Return the axes of the cloud as seen from the camera.
+
+    Raises `TacpipeError` if it is flat or the camera is inside.
+    """
     points = cloud.points_m.astype(np.float64)
     centre = points.mean(axis=0)
-    inner = points - centre
-    axes = np.linalg.eigh(inner.T @ inner)[1].T[::-1]  # (axis, xyz), longest first
-    extents = np.ptp(np.quantile(inner @ axes.T, [0.01, 0.99], axis=0), axis=0)  # (axis,), metres
+    centred = points - centre
+    principal_axes = np.linalg.eigh(centred.T @ centred)[1].T[::-1]  # (axis, xyz), longest first
+    extents = np.ptp(np.quantile(centred @ principal_axes.T, [0.01, 0.99], axis=0), axis=0)  # (axis,), metres
     if extents.min() < FLAT_M:
         raise TacpipeError(
             f"The cloud is {extents[0] * 1e3:.0f} by {extents[1] * 1e3:.0f} mm and {extents[2] * 1e3:.1f} mm thick: it is "
@@ -157,11 +164,11 @@ def _frame(cloud: Cloud, camera_m: Sequence[float]) -> _Frame:
             f"{np.linalg.norm(view) * 1e3:.0f} mm away. Give the camera's position in the cloud's frame."
         )
     view /= np.linalg.norm(view)
-    along = axes[0]
+    along = principal_axes[0]
     if abs(along @ view) > MAX_VIEW_COSINE:
-        across_view = inner - np.outer(inner @ view, view)
+        across_view = centred - np.outer(centred @ view, view)
         along = np.linalg.eigh(across_view.T @ across_view)[1][:, -1]
-    positions = inner @ along
+    positions = centred @ along
     along = along * np.sign((positions**3).sum() or 1.0)  # the skew of the cloud determines the sign of the axis
     across = np.cross(view, along)
     across *= np.sign(across @ G1_TO_G2 or 1.0) / np.linalg.norm(across)
@@ -192,15 +199,15 @@ class _Cuts:
         if width > self._opening_m[1]:
             return None  # narrower pairs are on top of the object, where the hand cannot reach around it
         position = self._across_m[cut]
-        lefts = cut[(position >= low) & (position <= low + EDGE_FRACTION * width)]
-        rights = cut[(position >= high - EDGE_FRACTION * width) & (position <= high)]
-        if not len(lefts) or not len(rights):
+        left_rows = cut[(position >= low) & (position <= low + EDGE_FRACTION * width)]
+        right_rows = cut[(position >= high - EDGE_FRACTION * width) & (position <= high)]
+        if not len(left_rows) or not len(right_rows):
             return None
-        scores, cosines = self._score_pairs(lefts, rights, shift_m)
+        scores, cosines = self._score_pairs(left_rows, right_rows, shift_m)
         left, right = np.unravel_index(int(np.argmax(scores)), scores.shape)
         if not np.isfinite(scores[left, right]):
             return None
-        grasp = _grasp(self._points[lefts[left]], self._points[rights[right]], self._camera_m)
+        grasp = _grasp(self._points[left_rows[left]], self._points[right_rows[right]], self._camera_m)
         off_deg = float(np.degrees(np.arccos(np.clip(cosines[left, right], -1, 1))))
         score = float(scores[left, right] - OFF_CENTRE_WEIGHT * abs(shift_m) / self._frame.length_m)
         return Candidate(grasp, score, off_deg, float(shift_m))
@@ -210,14 +217,14 @@ class _Cuts:
         offsets = self._points[rights][None] - self._points[lefts][:, None]  # (left, right, xyz)
         opening = np.linalg.norm(offsets, axis=2)
         closing = offsets / np.maximum(opening, 1e-9)[..., None]
-        on_left = -(closing * self._normals[lefts][:, None]).sum(axis=2)
-        on_right = (closing * self._normals[rights][None]).sum(axis=2)
-        cosines = np.minimum(on_left, on_right)
-        off = np.abs(self._along_m - shift_m) / HALF_CUT_M  # (point,), 1 at the edge of the cut
-        off_plane = (off[lefts][:, None] + off[rights][None]) / 2
-        askew = np.abs(closing @ self._frame.along) + np.abs(closing @ self._frame.view)
+        left_cosine = -(closing * self._normals[lefts][:, None]).sum(axis=2)
+        right_cosine = (closing * self._normals[rights][None]).sum(axis=2)
+        cosines = np.minimum(left_cosine, right_cosine)
+        distance_to_plane = np.abs(self._along_m - shift_m) / HALF_CUT_M  # (point,), 1 at the edge of the cut
+        off_plane = (distance_to_plane[lefts][:, None] + distance_to_plane[rights][None]) / 2
+        misalignment = np.abs(closing @ self._frame.along) + np.abs(closing @ self._frame.view)
         fits = (opening >= self._opening_m[0]) & (opening <= self._opening_m[1])
-        return np.where(fits, cosines - askew - OFF_PLANE_WEIGHT * off_plane, -np.inf), cosines
+        return np.where(fits, cosines - misalignment - OFF_PLANE_WEIGHT * off_plane, -np.inf), cosines
 
 
 def _grasp(left: Floats, right: Floats, camera_m: Floats) -> Grasp:
@@ -280,14 +287,15 @@ def _draw_panel(
     axes.scatter(points_mm[:, right], points_mm[:, down], c=colours, s=3, linewidths=0, rasterized=True)
     for rank, candidate in reversed(list(enumerate(grasp_candidates, 1))):  # the best is drawn on top
         ends_mm = np.stack([candidate.grasp.g1_m, candidate.grasp.g2_m]) * 1e3  # (finger, xyz)
-        _line(axes, ends_mm[:, [right, down]], rank, with_legend=ranks)
+        _draw_grasp(axes, ends_mm[:, [right, down]], rank, with_legend=ranks)
     axes.set_aspect("equal")
     axes.invert_yaxis()
     axes.set_xlabel(f"{'xyz'[right]} (mm)")
     axes.set_ylabel(f"{'xyz'[down]} (mm)")
 
 
-def _line(axes: Axes, ends_mm: Floats, rank: int, *, with_legend: bool) -> None:
+def _draw_grasp(axes: Axes, ends_mm: Floats, rank: int, *, with_legend: bool) -> None:
+    """Draw a grasp as a line with an outline and its ends, thicker for the best; with its rank for a panel with a legend."""
     alpha = 1.0 if rank == 1 else 0.75
     axes.plot(*ends_mm.T, color="white", linewidth=3.5 if rank == 1 else 2.5, alpha=alpha)  # an outline
     axes.plot(*ends_mm.T, color="black", linewidth=2 if rank == 1 else 1, alpha=alpha)

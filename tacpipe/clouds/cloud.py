@@ -32,7 +32,7 @@ class Cloud:
     colours: Bytes | None = None  # (point, rgb), 0 to 255
 
     def __post_init__(self) -> None:
-        """Validate the arrays."""
+        """Check the arrays. Raises `TacpipeError` if their shapes do not match or points are not finite."""
         if self.points_m.ndim != 2 or self.points_m.shape[1] != 3:
             raise TacpipeError(f"Points have the shape {self.points_m.shape}; they must be (point, xyz).")
         if self.colours is not None and self.colours.shape != self.points_m.shape:
@@ -122,7 +122,10 @@ def parse_points(
 
 
 def _cast(path: Path, name: str, column: Floats, kind: np.dtype[Any]) -> AnyArray:
-    """Return a column (point,) in the type of its field; values beyond a float's range become infinite."""
+    """Return a column (point,) in the type of its field; values beyond a float's range become infinite.
+
+    Raises `TacpipeError` for integers that are out of range or not whole.
+    """
     if kind.kind in "iu":
         limits = np.iinfo(kind)
         wrong = ~((column >= limits.min) & (column <= limits.max) & (column == np.rint(column)))
@@ -204,9 +207,9 @@ class DepthFrame:
         """Return the frame that `to_bytes` encoded. Raises `TacpipeError` if it is not a frame or was cut off."""
         if len(content) < HEADER.size or not content.startswith(MAGIC):
             raise TacpipeError(f"{len(content)} bytes are not a depth frame; it must begin with {MAGIC.decode()}.")
-        _, width, height, coloured, *optics = HEADER.unpack_from(content)
+        _, width, height, has_colours, *optics = HEADER.unpack_from(content)
         pixels = width * height
-        if len(content) != HEADER.size + pixels * (5 if coloured else 2):
+        if len(content) != HEADER.size + pixels * (5 if has_colours else 2):
             raise TacpipeError(
                 f"A depth frame of {width} x {height} pixels has {len(content)} bytes, so it is incomplete."
             )
@@ -219,5 +222,5 @@ class DepthFrame:
             raise TacpipeError(f"A depth frame has the unit {optics[4]:g} m; it must be above 0 and at most 1.")
         depth = np.frombuffer(content, "<u2", pixels, HEADER.size).reshape(height, width).astype(np.uint16)
         start = HEADER.size + 2 * pixels
-        colours = np.frombuffer(content, np.uint8, 3 * pixels, start).reshape(height, width, 3) if coloured else None
+        colours = np.frombuffer(content, np.uint8, 3 * pixels, start).reshape(height, width, 3) if has_colours else None
         return cls(depth, (optics[0], optics[1]), (optics[2], optics[3]), optics[4], colours)

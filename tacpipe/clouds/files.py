@@ -23,16 +23,16 @@ def read(path: Path | str) -> Cloud:
     Raises `TacpipeError` with the path if the file is missing, not a cloud, empty or cut off, contains points that are
     not finite, or is so large that it cannot be in metres.
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise TacpipeError(f"{path} is not a supported cloud; its suffix must be one of {', '.join(SUFFIXES)}.")
-    if not path.exists() or path.is_dir():
-        raise TacpipeError(f"{path} does not exist; give a point cloud file.")
-    regular.require(path, path.stat().st_mode)
-    if not path.stat().st_size:
-        raise TacpipeError(f"{path} is empty. Copy it again from its source.")
-    cloud = READERS.get(path.suffix.lower(), _read_text)(path)
-    require_metres(path, cloud)
+    file = Path(path)
+    if file.suffix.lower() not in SUFFIXES:
+        raise TacpipeError(f"{file} is not a supported cloud; its suffix must be one of {', '.join(SUFFIXES)}.")
+    if not file.exists() or file.is_dir():
+        raise TacpipeError(f"{file} does not exist; give a point cloud file.")
+    regular.require(file, file.stat().st_mode)
+    if not file.stat().st_size:
+        raise TacpipeError(f"{file} is empty. Copy it again from its source.")
+    cloud = READERS.get(file.suffix.lower(), _read_text)(file)
+    require_metres(file, cloud)
     return cloud
 
 
@@ -47,6 +47,7 @@ def require_metres(path: Path, cloud: Cloud) -> None:
 
 
 def _read_pcd(path: Path) -> Cloud:
+    """Return the cloud of a PCD file; open3d reads only compressed ones. Raises `TacpipeError` as `read` does."""
     from tacpipe.clouds import point_files
 
     content = regular.content(path)
@@ -58,7 +59,10 @@ def _read_pcd(path: Path) -> Cloud:
 
 
 def _read_ply(path: Path) -> Cloud:
-    """Return the cloud of a PLY file. open3d is not used: a crafted header makes its parser write out of bounds."""
+    """Return the cloud of a PLY file. Raises `TacpipeError` as `read` does.
+
+    open3d is not used: a crafted header makes its parser write out of bounds.
+    """
     from tacpipe.clouds import point_files
 
     xyz, colours = point_files.parse_ply(path, regular.content(path))
@@ -74,7 +78,10 @@ def _read_text(path: Path) -> Cloud:
 
 
 def _declared_points(path: Path) -> int:
-    """Return the number of points that a text file declares in its first line, or its number of lines."""
+    """Return the number of points that a text file declares in its first line, or its number of lines.
+
+    Raises `TacpipeError` for a PTS file that declares no number, or more points than it contains.
+    """
     lines = path.read_bytes().splitlines()
     rows = [line.split() for line in lines if line.strip() and not line.startswith(b"#")]
     if path.suffix.lower() != ".pts":
@@ -91,7 +98,12 @@ def _declared_points(path: Path) -> int:
 
 
 def _read_with_open3d(path: Path, declared: int) -> Cloud:
-    """Read a cloud with open3d. Raises `TacpipeError` if it does not have the declared number of finite points."""
+    """Return the cloud that open3d reads.
+
+    Raises `TacpipeError` if it does not have the declared number of finite points.
+
+    Colours outside 0 to 1 are an error, too.
+    """
     with open3d() as library:
         cloud = library.io.read_point_cloud(str(path), format=path.suffix.lower()[1:])
         with np.errstate(over="ignore"):  # values beyond float32 become infinite
@@ -115,6 +127,7 @@ def _read_with_open3d(path: Path, declared: int) -> Cloud:
 
 
 def _require_finite(path: Path, points: AnyArray) -> None:
+    """Raise `TacpipeError` if some of the points (point, xyz) are not finite."""
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         raise TacpipeError(

@@ -43,19 +43,19 @@ class Quadric:
 
 
 def fit_quadric(points_m: Floats) -> tuple[float, Quadric]:
-    """Fit a quadric to points (point, xyz) and return their RMS distance from it, in metres, and the quadric."""
+    """Return the quadric that fits points (point, xyz) best, after their RMS distance from it in metres."""
     from scipy.linalg import eigh
 
     centre = points_m.mean(axis=0)
     points = (points_m - centre) / UNIT_M
     terms = _terms(points)  # (point, coefficient)
     moments = terms.T @ terms / len(points)
-    steep = np.sum([part.T @ part for part in _slopes(points)], axis=0)[:9, :9] / len(points)
-    free = moments[:9, :9] - np.outer(moments[:9, 9], moments[9, :9])  # the constant makes the mean value zero
-    values, vectors = eigh(free, steep + EPSILON * np.eye(9), subset_by_index=(0, 0))
-    first = vectors[:, 0]
-    misfit = float(np.sqrt(max(values[0], 0.0)))
-    return misfit * UNIT_M, Quadric(np.append(first, -moments[9, :9] @ first), centre)
+    gradients = np.sum([part.T @ part for part in _slopes(points)], axis=0)[:9, :9] / len(points)
+    variances = moments[:9, :9] - np.outer(moments[:9, 9], moments[9, :9])  # the constant makes the mean value zero
+    values, vectors = eigh(variances, gradients + EPSILON * np.eye(9), subset_by_index=(0, 0))
+    coefficients = vectors[:, 0]
+    rms = float(np.sqrt(max(values[0], 0.0)))
+    return rms * UNIT_M, Quadric(np.append(coefficients, -moments[9, :9] @ coefficients), centre)
 
 
 def _terms(points: Floats) -> Floats:
@@ -98,12 +98,12 @@ def features(cloud: Cloud, grasp: Grasp) -> dict[str, float]:
     features |= _extent(points)
     features |= _principal_axes(points)
     features |= _profile(points, grasp.opening_m)
-    for name, place_m in (("g1", -grasp.opening_m / 2), ("g2", grasp.opening_m / 2)):
-        distances = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)  # (point,)
+    for name, contact_m in (("g1", -grasp.opening_m / 2), ("g2", grasp.opening_m / 2)):
+        distances = np.linalg.norm(points - np.array([0.0, contact_m, 0.0]), axis=1)  # (point,)
         for radius_m in RADII_M:
-            features |= _patch(f"{name}_{radius_m * 1000:.0f}mm", points[distances < radius_m], place_m, len(points))
-        features |= _quadric_features(f"{name}_whole", points, place_m) | _quadric_features(
-            f"{name}_near", points[distances < NEAR_M], place_m
+            features |= _patch(f"{name}_{radius_m * 1000:.0f}mm", points[distances < radius_m], contact_m, len(points))
+        features |= _quadric_features(f"{name}_whole", points, contact_m) | _quadric_features(
+            f"{name}_near", points[distances < NEAR_M], contact_m
         )
         if cloud.colours is not None:
             nearest = np.argsort(distances, kind="stable")[:COLOUR_POINTS]
@@ -114,7 +114,7 @@ def features(cloud: Cloud, grasp: Grasp) -> dict[str, float]:
 
 
 def pose_features(grasp: Grasp) -> dict[str, float]:
-    """Return the position and orientation of the grasp in the frame of its cloud. These depend on where the object is."""
+    """Return the position and orientation of the grasp in the frame of its cloud, which depend on where the object is."""
     wrist = wrist_axes(grasp)
     features = _named_components("g1_m", grasp.g1_m, "xyz") | _named_components("g2_m", grasp.g2_m, "xyz")
     return (
@@ -180,7 +180,7 @@ def _profile(points: Floats, opening_m: float) -> dict[str, float]:
     return _named_components("profile_m", profile, [str(index) for index in range(BINS)])
 
 
-def _patch(name: str, points: Floats, place_m: float, total: int) -> dict[str, float]:
+def _patch(name: str, points: Floats, contact_m: float, total: int) -> dict[str, float]:
     """Return the shape of the surface around a contact: the fraction that is visible, its spreads, flatness and normal."""
     parts = (
         "share",
@@ -195,28 +195,28 @@ def _patch(name: str, points: Floats, place_m: float, total: int) -> dict[str, f
         return _named_components(name, np.zeros(len(parts)), parts)
     variances, directions = np.linalg.eigh(np.cov(points.T))
     variances = np.maximum(variances, 0)
-    normal = _outward_normal(directions[:, 0], place_m)
-    offset = (points.mean(axis=0) - (0.0, place_m, 0.0)) @ normal
+    normal = _outward_normal(directions[:, 0], contact_m)
+    offset = (points.mean(axis=0) - (0.0, contact_m, 0.0)) @ normal
     flatness = variances[0] / max(variances.sum(), 1e-18)
     return _named_components(name, [len(points) / total, *np.sqrt(variances), flatness, *normal, offset], parts)
 
 
-def _quadric_features(name: str, points: Floats, place_m: float) -> dict[str, float]:
+def _quadric_features(name: str, points: Floats, contact_m: float) -> dict[str, float]:
     """Return the misfit of a quadric to the points, and its normal at a contact, which may be on a hidden side."""
     parts = ("misfit_m", *(f"faces_{axis}" for axis in AXES))
     if len(points) < MIN_FITTED_POINTS:
         return _named_components(name, np.zeros(len(parts)), parts)
     misfit_m, surface = fit_quadric(points)
-    normal = _outward_normal(surface.normal(np.array([0.0, place_m, 0.0])), place_m)
+    normal = _outward_normal(surface.normal(np.array([0.0, contact_m, 0.0])), contact_m)
     return _named_components(name, [misfit_m, *normal], parts)
 
 
-def _outward_normal(normal: Floats, place_m: float) -> Floats:
+def _outward_normal(normal: Floats, contact_m: float) -> Floats:
     """Return the normal (xyz,) at a contact with the sign for which it points away from the object.
 
-    That is up, and to the side of the finger, which touches at ``place_m`` on the closing axis.
+    That is up, and to the side of the finger, which touches at ``contact_m`` on the closing axis.
     """
-    return normal if np.sign(place_m) * normal[1] - normal[0] > 0 else -normal
+    return normal if np.sign(contact_m) * normal[1] - normal[0] > 0 else -normal
 
 
 def _colours(colours: Floats) -> dict[str, float]:
@@ -248,7 +248,7 @@ class Extent:
 
     @classmethod
     def from_cloud(cls, cloud: Cloud) -> Extent:
-        """Return the extent of a cloud."""
+        """Return the extent of a cloud, which is independent of its rotation."""
         points = cloud.points_m.astype(np.float64)
         colours = None
         if cloud.colours is not None:
@@ -257,7 +257,7 @@ class Extent:
 
 
 def _corners(points_m: AnyFloats) -> Indices:
-    """Return the indices of the corners of the convex hull of points (point, xyz); all if they are in one plane."""
+    """Return the indices of the corners of the convex hull of points (point, xyz); all indices if they are in one plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -268,7 +268,7 @@ def _corners(points_m: AnyFloats) -> Indices:
 
 
 def minmax(points: AnyFloats, extent: Extent, rotation: AnyFloats) -> AnyFloats:
-    """Scale rotated points (point, xyz) so that the cloud fills -1 to 1 along each axis.
+    """Return points (point, xyz), already rotated by ``rotation`` (3, 3), such that the cloud fills -1 to 1 on each axis.
 
     This discards sizes and proportions, as the letter does, and distorts a cloud that was rotated before.
     """
@@ -308,7 +308,7 @@ def normalise(
 
 
 def normalise_colours(method: str, colours: AnyFloats, extent: Extent) -> AnyFloats:
-    """Scale colours (point, rgb) from 0..1 to -1..1: by their extremes (minmax), by black and white (wrist), or not."""
+    """Return colours (point, rgb) scaled to -1..1: by their extremes (minmax), by black and white (wrist), or not."""
     if method == "minmax":
         assert extent.colours is not None
         low, high = extent.colours

@@ -33,7 +33,7 @@ class Grasp:
     wrist: Floats | None = None
 
     def __post_init__(self) -> None:
-        """Validate the points and the wrist."""
+        """Check the points and the wrist. Raises `TacpipeError` if they are not finite, equal, or not a rotation."""
         if not (np.isfinite(self.g1_m).all() and np.isfinite(self.g2_m).all()):
             raise TacpipeError(f"The grasp points are {self.g1_m} and {self.g2_m}; both must be finite, in metres.")
         if self.opening_m == 0:

@@ -122,12 +122,16 @@ def require_compressed_size(path: Path, content: bytes, header: Header) -> None:
 
     Two 4-byte numbers come first: the compressed and the uncompressed size.
     """
-    needed, available = header.points * header.point.itemsize, len(content) - header.length - 8
-    size, declared = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
-    if available < size or declared != needed or needed > size * LZF_MAX_RATIO:
+    points_size, available_size = header.points * header.point.itemsize, len(content) - header.length - 8
+    compressed_size, declared_size = np.frombuffer(content[header.length :][:8].ljust(8, b"\0"), "<u4").tolist()
+    if (
+        available_size < compressed_size
+        or declared_size != points_size
+        or points_size > compressed_size * LZF_MAX_RATIO
+    ):
         raise TacpipeError(
-            f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(available, 0)} bytes "
-            f"follow that declare {size} compressed and {declared} uncompressed bytes: it was cut off "
+            f"{path} declares {header.points} points of {header.point.itemsize} bytes, and {max(available_size, 0)} bytes "
+            f"follow that declare {compressed_size} compressed and {declared_size} uncompressed bytes: it was cut off "
             "or its header is wrong. Copy the file again."
         )
 
@@ -142,7 +146,10 @@ def unpack_colours(packed: NDArray[np.uint32]) -> Bytes:
 
 
 def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the words after each keyword of the header, and the header's size in bytes."""
+    """Return the words after each keyword of the header, and the header's size in bytes.
+
+    Raises `TacpipeError` for an unknown or repeated keyword, and if there is no line DATA.
+    """
     lines: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in lines:
@@ -166,6 +173,10 @@ def _header_lines(path: Path, content: bytes) -> tuple[dict[str, list[str]], int
 
 
 def _whole_number(path: Path, keyword: str, words: list[str]) -> int:
+    """Return the number after a keyword.
+
+    Raises `TacpipeError` unless it is one whole number of at most `DIGITS` digits.
+    """
     if len(words) != 1 or not (words[0].isascii() and words[0].isdigit()) or len(words[0]) > DIGITS:
         raise TacpipeError(
             f"{path} has {keyword} {plain(' '.join(words))}; it must be a whole number of {DIGITS} digits at most. "
@@ -217,7 +228,10 @@ def _point_dtype(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
 
 
 def _parse_binary(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
-    """Return the points (point,) after a binary header; the library pads files with zeros to whole memory pages."""
+    """Return the points (point,) after a binary header; the library pads files with zeros to whole memory pages.
+
+    Raises `TacpipeError` if points are missing or other data follow.
+    """
     size = header.point.itemsize
     available, needed = len(content) - header.length, header.points * size
     if available < needed:
@@ -234,7 +248,10 @@ def _parse_binary(path: Path, content: bytes, header: Header) -> NDArray[np.void
 
 
 def _parse_text(path: Path, content: bytes, header: Header) -> NDArray[np.void]:
-    """Return the points (point,) of the lines after a text header, one point per line."""
+    """Return the points (point,) of the lines after a text header, one point per line.
+
+    Raises `TacpipeError` if their number differs from that in the header, or a value is invalid.
+    """
     lines = cloud.nonblank_lines(content[header.length :])
     if len(lines) != header.points:
         raise TacpipeError(
@@ -295,7 +312,7 @@ def parse_ply(path: Path, content: bytes) -> tuple[Float32s, Bytes | None]:
 
 
 def pack_ply(points_m: Float32s, colours: Bytes | None) -> bytes:
-    """Encode points (point, xyz) and colours (point, rgb) as a binary PLY file."""
+    """Return points (point, xyz) and colours (point, rgb), or None, as a binary PLY file."""
     vertex = np.dtype(
         [(axis, "<f4") for axis in PLY_POSITION] + [(name, "u1") for name in COLOUR if colours is not None]
     )
@@ -310,26 +327,38 @@ def pack_ply(points_m: Float32s, colours: Bytes | None) -> bytes:
 
 
 def _ply_header(path: Path, content: bytes) -> _Header:
-    end = content.find(b"end_header", 0, PLY_MAX_HEADER_BYTES)
-    stop = content.find(b"\n", end) + 1
-    lines = [line.split() for line in content[: max(end, 0)].decode("latin-1").splitlines()]
-    if end < 0 or not stop or lines[:1] != [["ply"]]:
+    """Return the header of a PLY file.
+
+    Raises `TacpipeError` if it is incomplete, or its format or vertices are unknown.
+    """
+    end_position = content.find(b"end_header", 0, PLY_MAX_HEADER_BYTES)
+    length = content.find(b"\n", end_position) + 1
+    lines = [line.split() for line in content[: max(end_position, 0)].decode("latin-1").splitlines()]
+    if end_position < 0 or not length or lines[:1] != [["ply"]]:
         raise TacpipeError(f"{path} is not a PLY file or was cut off: it must start with ply and have a full header.")
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
     starts = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
-    elements = [lines[start:end] for start, end in itertools.pairwise([*starts, len(lines)])]
-    vertex_index = next((number for number, (first, *_) in enumerate(elements) if first[1:2] == ["vertex"]), 0)
-    first = elements[vertex_index][0] if elements else []
-    before = [_element_size(element, form) for element in elements[:vertex_index]]
-    if form not in ORDERS or first[1:2] != ["vertex"] or len(first) != 3 or not _is_count(first[2]) or None in before:
+    elements = [lines[start:end_position] for start, end_position in itertools.pairwise([*starts, len(lines)])]
+    vertex_index = next(
+        (number for number, (declaration, *_) in enumerate(elements) if declaration[1:2] == ["vertex"]), 0
+    )
+    declaration = elements[vertex_index][0] if elements else []
+    earlier_sizes = [_element_size(element, form) for element in elements[:vertex_index]]
+    if (
+        form not in ORDERS
+        or declaration[1:2] != ["vertex"]
+        or len(declaration) != 3
+        or not _is_count(declaration[2])
+        or None in earlier_sizes
+    ):
         declared = elements[0][0][1:] if elements else []
         raise TacpipeError(
             f"{path} has the format {excerpt(form)} and the first element {excerpt(' '.join(declared))}; a cloud must have "
             f"one of the formats {', '.join(ORDERS)}, and its vertices come first."
         )
     rows = [row for row in elements[vertex_index] if row[:1] == ["property"]]
-    skipped = sum(size for size in before if size is not None)
-    return _Header(form, _vertex_dtype(path, rows, form), int(first[2]), stop, len(elements) == 1, skipped)
+    skipped = sum(size for size in earlier_sizes if size is not None)
+    return _Header(form, _vertex_dtype(path, rows, form), int(declaration[2]), length, len(elements) == 1, skipped)
 
 
 def _element_size(element: list[list[str]], form: str) -> int | None:
@@ -346,6 +375,10 @@ def _element_size(element: list[list[str]], form: str) -> int | None:
 
 
 def _vertex_dtype(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.void]:
+    """Return the dtype of a vertex in a PLY file of a format.
+
+    Raises `TacpipeError` for lists, or coordinates or colours of wrong types.
+    """
     kinds: dict[str, str] = {}
     for words in rows:
         if len(words) != 3 or words[1] not in LETTERS or words[2] in kinds:
@@ -353,9 +386,9 @@ def _vertex_dtype(path: Path, rows: list[list[str]], form: str) -> np.dtype[np.v
                 f"{path} has the vertices' {excerpt(' '.join(words))}; it must be a scalar type and a name."
             )
         kinds[words[2]] = LETTERS[words[1]]
-    floats = all(kinds.get(axis, "")[:1] == "f" for axis in PLY_POSITION)
-    coloured = all(kinds.get(name, "u1") == "u1" for name in COLOUR)
-    if not floats or not coloured:
+    are_floats = all(kinds.get(axis, "")[:1] == "f" for axis in PLY_POSITION)
+    are_bytes = all(kinds.get(name, "u1") == "u1" for name in COLOUR)
+    if not are_floats or not are_bytes:
         raise TacpipeError(
             f"{path} has vertices of {listed(kinds)}; x, y and z must be floats, and colours, if any, uchar."
         )

@@ -45,17 +45,17 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: in
     Raises `TacpipeError` if no table is found, no object is on it, none is near the grasp, or that object is too long.
     """
     points_m = scene.points_m.astype(np.float64)
-    above_m = heights_m(points_m, table_plane(points_m, grasp, limits, seed))  # (point,)
-    spread_m = 1.4826 * float(np.median(np.abs(above_m[np.abs(above_m) <= 3 * limits.plane_m])))  # standard deviation
-    front = np.flatnonzero(above_m > max(limits.plane_m, NOISE_DEVIATIONS * spread_m))
-    labels = _clusters(points_m[front], limits)
+    height_m = heights_m(points_m, table_plane(points_m, grasp, limits, seed))  # (point,)
+    noise_m = 1.4826 * float(np.median(np.abs(height_m[np.abs(height_m) <= 3 * limits.plane_m])))  # standard deviation
+    front_rows = np.flatnonzero(height_m > max(limits.plane_m, NOISE_DEVIATIONS * noise_m))
+    labels = _clusters(points_m[front_rows], limits)
     if not (labels >= 0).any():
         raise TacpipeError(
-            f"No object is on the table: no cluster of the {len(front)} points in front of it has "
+            f"No object is on the table: no cluster of the {len(front_rows)} points in front of it has "
             f"{limits.object_points} points within {1e3 * limits.cluster_m:g} mm of one another. Check the scene, or lower "
             f"--object-points."
         )
-    distances_m = np.where(labels >= 0, distances_from_grasp_m(points_m[front], grasp), np.inf)
+    distances_m = np.where(labels >= 0, distances_from_grasp_m(points_m[front_rows], grasp), np.inf)
     nearest = int(distances_m.argmin())
     if distances_m[nearest] > limits.near_m:
         raise TacpipeError(
@@ -63,7 +63,7 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: in
             f"{1e3 * distances_m[nearest]:.1f} mm from the lines of the grasp; it must be "
             f"{1e3 * limits.near_m:g} mm or less, in one frame. Check the grasp, or allow more with --near-mm."
         )
-    rows = front[labels == labels[nearest]]
+    rows = front_rows[labels == labels[nearest]]
     length_m = float(np.ptp(points_m[rows], axis=0).max())
     if length_m > MAX_EXTENT_M:
         raise TacpipeError(

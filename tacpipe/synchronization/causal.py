@@ -53,10 +53,11 @@ class Grid:
         gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
-        """Prepare a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``.
+        """Prepare a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``, by whose columns it reads.
 
-        ``gap_ns`` is the age of the newest sample above which a stream is in a gap. ``origin_ns`` is the first point of
-        an earlier uniform grid to continue; by default, a grid starts at the master's first sample.
+        ``gap_ns`` is the age of the newest sample above which a stream is in a gap. ``rate_hz`` is the rate of a
+        uniform grid, None for others. ``origin_ns`` is the first point of an earlier uniform grid to continue; by
+        default, a grid starts at the master's first sample.
         """
         self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}
@@ -88,21 +89,24 @@ class Grid:
         Samples whose time is before that of an earlier sample are dropped and counted in `late`. Samples within
         already computed rows are counted, too.
         """
-        source = self._sources[stream]
-        if len(t_ns):
-            least_ns = int(t_ns[0]) if source.newest_ns is None else source.newest_ns
-            in_order = t_ns >= np.maximum.accumulate(np.maximum(t_ns, least_ns))
-            if not in_order.all():
-                self.late[stream] += int(np.count_nonzero(~in_order))
-                t_ns, values = t_ns[in_order], values[in_order]
         if not len(t_ns):
             return
-        if self._until_ns is not None and t_ns[0] <= self._until_ns:
-            self.late[stream] += int(np.count_nonzero(t_ns <= self._until_ns))
-        source.push(t_ns, values)
+        source = self._sources[stream]
+        least_ns = int(t_ns[0]) if source.newest_ns is None else source.newest_ns
+        in_order = t_ns >= np.maximum.accumulate(np.maximum(t_ns, least_ns))
+        ordered_ns = t_ns[in_order]
+        self.late[stream] += len(t_ns) - len(ordered_ns)
+        if not len(ordered_ns):
+            return
+        if self._until_ns is not None and ordered_ns[0] <= self._until_ns:
+            self.late[stream] += int(np.count_nonzero(ordered_ns <= self._until_ns))
+        source.push(ordered_ns, values[in_order])
 
     def rows(self, until_ns: int) -> GridRows:
-        """Return the new rows up to ``until_ns``. All samples up to this time must have been pushed."""
+        """Return the new rows up to ``until_ns``, empty before each stream has a sample.
+
+        All samples up to this time must have been pushed.
+        """
         after_ns, self._until_ns = self._until_ns, max(until_ns, self._until_ns or until_ns)
         grid_ns = self._grid(after_ns, self._until_ns)
         firsts = [source.first_ns for source in self._sources.values()]
@@ -120,7 +124,7 @@ class Grid:
         return GridRows(grid_ns, has_samples, newest_ns, gap, values)
 
     def _grid(self, after_ns: int | None, until_ns: int) -> Times:
-        """Return the grid points after ``after_ns`` up to ``until_ns`` (row,)."""
+        """Return the grid points after ``after_ns`` (None: from the first) up to ``until_ns`` (row,)."""
         master = self._sources[self._master]
         if master.first_ns is None:
             return np.zeros(0, np.int64)
@@ -163,20 +167,20 @@ class _Source:
 
     def push(self, t_ns: Times, values: AnyFloats) -> None:
         """Add samples with non-decreasing times."""
-        before = values[:1] if self._before is None else self._before[None]
-        extended = np.concatenate([before, values]) if len(self._wraps) or len(self._compared) else values
+        previous = values[:1] if self._before is None else self._before[None]
+        extended = np.concatenate([previous, values]) if len(self._wraps) or len(self._compared) else values
         self._reserve(len(t_ns))
-        added = slice(self._stop, self._stop + len(t_ns))
-        self._t_ns[added], self._values[added] = t_ns, values
+        added_rows = slice(self._stop, self._stop + len(t_ns))
+        self._t_ns[added_rows], self._values[added_rows] = t_ns, values
         if self._before is None and self.levels is not None:
             distance = (self.levels - values[0])[self._wraps]
             self._wrap_counts = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
         if len(self._wraps):
             wrap_counts = self._wrap_counts + np.cumsum(count_wraps(extended[:, self._wraps]), axis=0)
-            self._values[added, self._wraps] += RANGE * wrap_counts
+            self._values[added_rows, self._wraps] += RANGE * wrap_counts
             self._wrap_counts = wrap_counts[-1]
         if len(self._compared):
-            self._repeated[added] = (extended[1:, self._compared] == extended[:-1, self._compared]).all(axis=1)
+            self._repeated[added_rows] = (extended[1:, self._compared] == extended[:-1, self._compared]).all(axis=1)
             if self._before is None:
                 self._repeated[self._stop] = False
         self._before = values[-1].copy()
@@ -191,8 +195,8 @@ class _Source:
 
     def at(self, grid_ns: Times) -> tuple[Times, Floats]:
         """Return times (grid,) and values (grid, column) of the newest sample at each grid point."""
-        filled = slice(self._start, self._stop)
-        t_ns, values = self._t_ns[filled], self._values[filled]
+        buffered = slice(self._start, self._stop)
+        t_ns, values = self._t_ns[buffered], self._values[buffered]
         rows = newest_rows(t_ns, grid_ns)
         samples: Floats = values[rows]
         if len(self._medians):
@@ -210,12 +214,12 @@ class _Source:
         """Ensure space for ``count`` samples after the buffered ones."""
         if self._stop + count <= len(self._t_ns):
             return
-        filled = slice(self._start, self._stop)
+        buffered = slice(self._start, self._stop)
         length = self._stop - self._start
-        room = max(len(self._t_ns), 2 * (length + count))
+        capacity = max(len(self._t_ns), 2 * (length + count))
         for name in ("_t_ns", "_values", "_repeated"):
             old = getattr(self, name)
-            larger = np.zeros((room, *old.shape[1:]), old.dtype)
-            larger[:length] = old[filled]
+            larger = np.zeros((capacity, *old.shape[1:]), old.dtype)
+            larger[:length] = old[buffered]
             setattr(self, name, larger)
         self._start, self._stop = 0, length

@@ -21,7 +21,10 @@ BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated 
 
 
 def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, in the order of the stream. ``keep`` stores each."""
+    """Return field and values of each channel on the grid, in the order of the stream. ``keep`` stores each.
+
+    ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated.
+    """
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
@@ -39,13 +42,11 @@ def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Ke
         interpolation = method.partition(" ")[0]
         rows = slice(None) if interpolation == "median" else used
         for block in _blocks(stream, members, interpolation, len(grid_ns)):
-            for name, column in zip(
-                block, _interpolate_samples(stream, block, interpolation, grid_ns, rows).T, strict=True
-            ):
+            columns = _interpolate_samples(stream, block, interpolation, grid_ns, rows).T
+            for name, column in zip(block, columns, strict=True):
                 kind = streams.interpolated_type(stream.columns.schema.field(name).type)
-                grid_columns[name] = _to_column(
-                    streams.grid_field(stream.name, stream.field(name), interpolation, kind), column, keep
-                )
+                field = streams.grid_field(stream.name, stream.field(name), interpolation, kind)
+                grid_columns[name] = _to_column(field, column, keep)
     return [grid_columns[name] for name in stream.channels]
 
 
@@ -76,7 +77,10 @@ def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolatio
 
 
 def _blocks(stream: TimedStream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
-    """Return the channels to interpolate at once: the four of a quaternion, or as many as fit in a block."""
+    """Return the channels to interpolate at once: the four of a quaternion, or as many as fit in a block.
+
+    Raises `TacpipeError` if a quaternion lacks a component.
+    """
     if interpolation == "slerp":
         parts = [stream.columns.schema.field(name) for name in members]
         return [[members[i] for i in streams.quaternion_order(stream.name, parts)]]
@@ -88,7 +92,7 @@ def _blocks(stream: TimedStream, members: list[str], interpolation: str, points:
 def _interpolate_samples(
     stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any
 ) -> Floats:
-    """Interpolate channels (grid, channel) from the rows ``used``."""
+    """Return the values of channels at grid points (grid, channel), interpolated from the rows ``used``."""
     import numpy as np
 
     from tacpipe.signals.resampling import linear, median_around, slerp
@@ -109,7 +113,10 @@ def _to_column(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
 
 
 def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample."""
+    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample in ns.
+
+    ``exact`` are the rows whose times are the grid points, or None.
+    """
     import numpy as np
 
     from tacpipe.signals.resampling import in_gap, nearest_rows
@@ -120,7 +127,10 @@ def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int
 
 
 def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
-    """Return the time (grid,) from each point to the arrival of the last sample that `channels` uses for it, at least 0."""
+    """Return the time (grid,) in ns from each point to the arrival of the last sample that `channels` uses for it.
+
+    It is 0 if that sample arrived before.
+    """
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
@@ -132,7 +142,7 @@ def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> 
 
 
 def online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample."""
+    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample in ns."""
     from tacpipe.signals.resampling import is_overdue, newest_rows
 
     rows = newest_rows(stream.t_ns, grid_ns)
@@ -141,6 +151,7 @@ def online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridC
 
 
 def _masks(name: str, repeated: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:
+    """Return the fields and values of a stream's masks ``held`` and ``gap`` and of the distances ``dt_ns``."""
     import pyarrow as pa
 
     mask = {"unit": "1", "quantity": "mask", "stream": name}

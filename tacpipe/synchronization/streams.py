@@ -161,7 +161,7 @@ def may_be_signal(schema: pa.Schema) -> bool:
 
 
 def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> TimedStream:
-    """Convert a stream to the host's clock. ``clock`` selects the times: device, arrival or auto.
+    """Return a stream with times on the host's clock. ``clock`` selects the times: device, arrival or auto.
 
     Raises `TacpipeError` if times are missing or decrease, or the device's clock cannot be fitted.
     """
@@ -183,7 +183,10 @@ def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> Ti
 def _convert_device_times(
     recording: str, stream: str, columns: Columns, arrival_ns: Times
 ) -> tuple[Int64s, dict[str, Attribute]]:
-    """Return the device times (time,) in ns of samples, converted to the host's clock, and attributes of the fit."""
+    """Return the device times (time,) in ns of samples, converted to the host's clock, and attributes of the fit.
+
+    Raises `TacpipeError` if device times are missing or no integers, or cannot be fitted.
+    """
     import pyarrow as pa
 
     from tacpipe.arrays import from_arrow
@@ -240,7 +243,7 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
 
 
 def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[TimedStream, int]:
-    """Unwrap the 16-bit tactile counts of a stream; also return the number of channels that wrapped.
+    """Return a stream with unwrapped 16-bit tactile counts, and the number of channels that wrapped.
 
     ``keep`` stores the values of such a channel, possibly on disk, and returns them.
     """
@@ -250,13 +253,13 @@ def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[Time
     from tacpipe.signals.repairs import unwrap
 
     changed: dict[str, Int32s] = {}
-    for kind in stream.columns.schema:
-        tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
-        if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
-            values = from_arrow(stream.columns.column(kind.name))
+    for channel in stream.columns.schema:
+        tactile = (channel.metadata or {}).get(b"quantity") == b"tactile"
+        if tactile and pa.types.is_integer(channel.type) and channel.type.bit_width == 16:
+            values = from_arrow(stream.columns.column(channel.name))
             unwrapped_values = unwrap(values)
             if unwrapped_values is not values:
-                changed[kind.name] = keep(unwrapped_values)
+                changed[channel.name] = keep(unwrapped_values)
     return replace(stream, unwrapped=changed), len(changed)
 
 
@@ -320,12 +323,12 @@ def grid(
         selected &= np.append(np.diff(grid_ns) > 0, True)
     rows = np.flatnonzero(selected)
     if not len(rows):
-        late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
-        early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
+        latest = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
+        earliest = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
-            f"Recording {recording}: no row of {master.name} is within the time range of all streams. Stream {late.name} "
-            f"starts last, at {printable.moment(int(late.t_ns[0]))}, and {early.name} ends first, at "
-            f"{printable.moment(int(early.t_ns[-1]))}. Exclude one of them with --without, or check their clocks."
+            f"Recording {recording}: no row of {master.name} is within the time range of all streams. Stream {latest.name} "
+            f"starts last, at {printable.moment(int(latest.t_ns[0]))}, and {earliest.name} ends first, at "
+            f"{printable.moment(int(earliest.t_ns[-1]))}. Exclude one of them with --without, or check their clocks."
         )
     return grid_ns[rows], rows
 

@@ -38,22 +38,22 @@ def open_for_model(recordings: Dataset | Recording, chain: OpenedChain | None) -
     Missing stages are run, as by ``tacpipe predict``. Raises `UsageError` for anything other than a dataset or a
     recording, and if it passed through other stages.
     """
-    if isinstance(recordings, Recording):
-        recordings = recordings.alone
-    if not isinstance(recordings, Dataset):
+    dataset = recordings.alone if isinstance(recordings, Recording) else recordings
+    if not isinstance(dataset, Dataset):
         raise UsageError(
             f"A {type(recordings).__name__} is not a dataset or a recording. Give tacpipe.open(PATH), or one of its "
             f"recordings: tacpipe.open(PATH)['trial-000']."
         )
-    if chain is None or list(recordings.source.chain) == list(chain.steps):
-        return recordings
-    _check(chain.steps, recordings)
+    if chain is None or list(dataset.source.chain) == list(chain.steps):
+        return dataset
+    _check_stages(chain.steps, dataset)
     from tacpipe.engine import by_recording
 
-    return by_recording.run_chain_of_model(recordings, chain.model)
+    return by_recording.run_chain_of_model(dataset, chain.model)
 
 
-def _check(expected: Sequence[Step], recordings: Dataset) -> None:
+def _check_stages(expected: Sequence[Step], recordings: Dataset) -> None:
+    """Raise `UsageError` unless the recordings went through the first of the ``expected`` stages and no others."""
     chain = recordings.source.chain
     if list(chain) != list(expected[: len(chain)]):
         raise UsageError(
@@ -72,12 +72,13 @@ def _command(step: Step) -> str:
     """Return the command of a step of a chain, with the params that differ from their defaults."""
     from tacpipe.plugins import params, registry
 
-    usual = params.to_input(params.from_json(registry.load(step["stage"]), {}))
+    default_values = params.to_input(params.from_json(registry.load(step["stage"]), {}))
     words = [step["stage"].replace(".", " ")]
     for name, value in params.with_current_names(step["stage"], step["params"]).items():
-        if usual.get(name) != value:
+        if default_values.get(name) != value:
             option = name.replace("_", "-")
-            words.append(f"--{'' if value else 'no-'}{option}" if isinstance(value, bool) else f"--{option} {value}")
+            switch = f"--{option}" if value else f"--no-{option}"
+            words.append(switch if isinstance(value, bool) else f"--{option} {value}")
     return " ".join(words)
 
 

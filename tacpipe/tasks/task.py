@@ -170,7 +170,7 @@ Uncertain = TypeVar("Uncertain", bound=Levelled)
 
 
 def percents(levels: AnyFloats) -> tuple[int, ...]:
-    """Convert levels from fractions to percent.
+    """Return levels, which are fractions, in percent.
 
     >>> import numpy as np
     >>> percents(np.array([0.1, 0.5, 0.9]))

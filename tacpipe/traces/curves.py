@@ -78,15 +78,15 @@ def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
 
 
 def unroll_readings(t_ns: Times, values: Floats) -> tuple[Times, Floats]:
-    """Flatten rows of successive readings (time, reading) to one channel, and return its times and values (time, 1).
+    """Return the times and values (time, 1) of rows of successive readings (time, reading), flattened to one channel.
 
     >>> [part.ravel().tolist() for part in unroll_readings(np.array([0, 10]), np.array([[1.0, 2.0], [3.0, 4.0]]))]
     [[0, 5, 10, 15], [1.0, 2.0, 3.0, 4.0]]
     """
     readings = values.shape[1]
     step_ns = np.append(np.diff(t_ns), np.median(np.diff(t_ns)))  # (time,)
-    at_ns = t_ns[:, None] + (step_ns[:, None] * np.arange(readings) / readings).astype(np.int64)
-    return at_ns.ravel(), values.reshape(-1, 1)
+    reading_ns = t_ns[:, None] + (step_ns[:, None] * np.arange(readings) / readings).astype(np.int64)
+    return reading_ns.ravel(), values.reshape(-1, 1)
 
 
 def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
@@ -99,6 +99,7 @@ def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
 
 
 def _is_drawn(field: pa.Field, about: Mapping[str, str]) -> bool:
+    """Return whether a column is drawn as a curve: a number that is neither a clock nor of an undrawn quantity."""
     import pyarrow as pa
 
     is_number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
@@ -153,8 +154,8 @@ def _vectors(table: pa.Table, quantity: str, parts: str) -> dict[str, list[pa.Fi
     by_name: dict[str, dict[str, pa.Field]] = {}
     for field in table.schema:
         if field_metadata(field).get("quantity") == quantity:
-            shared = arm.split_name(field.name)[1]
-            by_name.setdefault(shared, {})[arm.component(field)] = field
+            common_name = arm.split_name(field.name)[1]
+            by_name.setdefault(common_name, {})[arm.component(field)] = field
     return {
         name: [fields_by_part[part] for part in parts]
         for name, fields_by_part in by_name.items()

@@ -33,7 +33,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def map_colours(values: AnyArray, low: float, high: float) -> Bytes:
-    """Map ``values`` (…) to colours (…, rgb) on a scale from ``low`` to ``high``; NaN is black.
+    """Return colours (…, rgb) of ``values`` (…) on a scale from ``low`` to ``high``; NaN is black.
 
     A scale that starts below 0 has the background colour in its middle, otherwise at its lower end.
 
@@ -93,7 +93,7 @@ def picture_rows(curves: Sequence[Curves], fingers: Sequence[Taxels]) -> list[Pi
 
 
 def svg(all_rows: Sequence[PictureRow]) -> str:
-    """Draw the first eight rows as an SVG; empty if there are none."""
+    """Return an SVG of the first eight rows, and how many more there are; "" if there are none."""
     if not all_rows:
         return ""
     visible = all_rows[:MAX_ROWS]
@@ -112,6 +112,7 @@ def svg(all_rows: Sequence[PictureRow]) -> str:
 
 
 def _draw_row(row: PictureRow, top: int, start_ns: int, stop_ns: int) -> list[str]:
+    """Return the SVG elements of a row at the height ``top``: its name, a line per channel, and its minimum and maximum."""
     t_ns, values = envelope(row.t_ns, row.values[:, :MAX_LINES], MAX_POINTS)
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)

@@ -48,19 +48,18 @@ def forecasts_from_table(table: pa.Table, measured: Sequence[Taxels]) -> list[Dr
     """
     if TIME not in table.column_names or table.num_rows < 2:
         return []
-    by_step: dict[int, set[str]] = {}
+    columns_by_step: dict[int, set[str]] = {}
     for field in table.schema:
         step = field_metadata(field).get("step", "0")
         if step.isdigit() and int(step) > 0:
-            by_step.setdefault(int(step), set()).add(str(field.name))
+            columns_by_step.setdefault(int(step), set()).add(str(field.name))
     t_ns = table.column(TIME).to_numpy()
-    return [
-        forecast
-        for taxels in measured
-        if len(taxels.t_ns) > 1
-        for step in sorted(by_step)
-        for forecast in _forecasts_for_step(table, t_ns, step, by_step[step], taxels)
-    ]
+    forecasts = []
+    for taxels in measured:
+        if len(taxels.t_ns) > 1:
+            for ahead in sorted(columns_by_step):
+                forecasts += _forecasts_for_step(table, t_ns, ahead, columns_by_step[ahead], taxels)
+    return forecasts
 
 
 def forecasts_from_values(values: Mapping[str, Attribute], measured: Sequence[Taxels]) -> list[DrawnForecast]:
@@ -83,21 +82,22 @@ def forecasts_from_values(values: Mapping[str, Attribute], measured: Sequence[Ta
 def _forecasts_for_step(
     table: pa.Table, t_ns: Times, step: int, columns: set[str], taxels: Taxels
 ) -> list[DrawnForecast]:
+    """Return a list with a finger's forecast of a step, at target times with measurements; empty if columns are missing."""
     prefix = f"{taxels.stream}_" if taxels.stream else ""
     names = [f"{prefix}{channel}_t{step}" for channel in taxels.channels]
     if not set(names) <= columns:
         return []
     target_ns = t_ns + step * int(np.median(np.diff(t_ns)))
-    covered = (target_ns >= taxels.t_ns[0]) & (target_ns <= taxels.t_ns[-1])
-    shape = (int(covered.sum()), *taxels.change.shape[1:])
-    measured = linear(taxels.t_ns, taxels.change.reshape(len(taxels.t_ns), -1), target_ns[covered])
-    predicted = matrix(table, names)[covered]
-    at_target = replace(taxels, t_ns=target_ns[covered])
+    is_measured = (target_ns >= taxels.t_ns[0]) & (target_ns <= taxels.t_ns[-1])
+    shape = (int(is_measured.sum()), *taxels.change.shape[1:])
+    measured = linear(taxels.t_ns, taxels.change.reshape(len(taxels.t_ns), -1), target_ns[is_measured])
+    predicted = matrix(table, names)[is_measured]
+    target_taxels = replace(taxels, t_ns=target_ns[is_measured])
     return [
         DrawnForecast(
             step,
-            replace(at_target, change=predicted.reshape(shape)),
-            replace(at_target, change=measured.reshape(shape)),
+            replace(target_taxels, change=predicted.reshape(shape)),
+            replace(target_taxels, change=measured.reshape(shape)),
         )
     ]
 
@@ -167,8 +167,8 @@ def classification_from_row(row: pa.Table, attributes: Mapping[str, Attribute]) 
     )
     if MODEL not in predictions:
         return None
-    first = {MODEL: predictions.pop(MODEL)}
-    return Classification(key, "" if label is None else str(label), {**first, **predictions}, scores)
+    model_prediction = {MODEL: predictions.pop(MODEL)}
+    return Classification(key, "" if label is None else str(label), {**model_prediction, **predictions}, scores)
 
 
 def _class(column: str) -> str:

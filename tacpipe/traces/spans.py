@@ -86,6 +86,7 @@ def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[
 
 
 def _column_spans(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:
+    """Return the spans in which a label column is constant and set."""
     encoded = column.combine_chunks().dictionary_encode()
     codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)  # (time,)
     values = {code: _text(value) for code, value in enumerate(encoded.dictionary.to_pylist())} | {-1: ""}
@@ -103,12 +104,17 @@ def _text(value: object) -> str:
 
 
 def _label_text(name: str, value: str, *, numbered: bool) -> str:
+    """Return the text of a span with a label's value; "" if the value is not a span.
+
+    ``numbered``: whether the values are more than 0 and 1.
+    """
     if name in _VALUE_NAMES:
         return _VALUE_NAMES[name].get(int(value), value) if value.lstrip("-").isdigit() else value
-    if numbered:
-        unset = set(_UNSET) - {"0"}
-        return "" if value in unset else f"{name} {value}" if value.lstrip("-").isdigit() else value
-    return "" if value in _UNSET else name
+    if value in _UNSET and not (numbered and value == "0"):
+        return ""
+    if not numbered:
+        return name
+    return f"{name} {value}" if value.lstrip("-").isdigit() else value
 
 
 def _runs(values: AnyArray) -> list[tuple[int, int]]:
@@ -141,12 +147,12 @@ def masked_gaps(table: pa.Table) -> list[Span]:
     spans = []
     for name in table.column_names:
         if name.endswith(GAP):
-            values = table.column(name).to_numpy().astype(bool)
+            is_gap = table.column(name).to_numpy().astype(bool)
             lane = name.removesuffix(GAP)
             spans += [
                 Span(lane, "gap", int(t_ns[start]), stop_ns(t_ns, stop))
-                for start, stop in _runs(values)
-                if values[start]
+                for start, stop in _runs(is_gap)
+                if is_gap[start]
             ]
     return spans
 

@@ -77,12 +77,13 @@ def taxels_from_table(stream: str, table: pa.Table) -> list[Taxels]:
 
 
 def _taxels_from_fields(stream: str, finger: str, table: pa.Table, fields: Sequence[pa.Field]) -> Taxels:
-    fields, axes = _order_by_taxel(fields)
-    columns = [field.name for field in fields]
+    """Return the taxels of a finger with tactile columns ``fields``; ``finger`` is "" if the stream has only one."""
+    ordered, axes = _order_by_taxel(fields)
+    columns = [field.name for field in ordered]
     t_ns, values = table.column(TIME).to_numpy(), matrix(table, columns)
-    firsts = fields[::axes]
+    firsts = ordered[::axes]
     positions, unit = places.taxel_positions(firsts)
-    levels = _rest_levels(fields, values, t_ns)
+    levels = _rest_levels(ordered, values, t_ns)
     names = tuple(field.name.rpartition("_")[0] if axes == 3 else field.name for field in firsts)
     if finger:
         names = tuple(name.removeprefix(f"{finger}_") for name in names)
@@ -113,8 +114,8 @@ def _order_by_taxel(fields: Sequence[pa.Field]) -> tuple[list[pa.Field], int]:
     for field in fields:
         about = field_metadata(field)
         axis = about.get("axis", "")
-        part, shared = (axis, field.name.removesuffix(axis)) if axis else arm.split_name(field.name)
-        vectors.setdefault(shared, {})[part] = field
+        part, taxel_name = (axis, field.name.removesuffix(axis)) if axis else arm.split_name(field.name)
+        vectors.setdefault(taxel_name, {})[part] = field
     if vectors and all(set(vector) == set("xyz") for vector in vectors.values()):
         return [vector[axis] for vector in vectors.values() for axis in "xyz"], 3
     return list(fields), 1
@@ -123,7 +124,7 @@ def _order_by_taxel(fields: Sequence[pa.Field]) -> tuple[list[pa.Field], int]:
 def scale(values: Floats) -> tuple[float, float]:
     """Return the ends of a colour scale: 0 and the 99.5 % quantile of ``values``, or ± that quantile if both signs occur.
 
-    For values far from 0, such as raw readings, the ends are their minimum and maximum.
+    For values far from 0, such as raw readings, the ends are their minimum and maximum; (0, 1) without values.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -132,7 +133,8 @@ def scale(values: Floats) -> tuple[float, float]:
     if low > 0.2 * high > 0:
         return low, high
     reach = max(float(np.quantile(np.abs(finite), SCALE_QUANTILE)), MIN_SCALE)
-    return (-reach, reach) if float(np.quantile(finite, 1 - SCALE_QUANTILE)) < -0.1 * reach else (0.0, reach)
+    has_negatives = float(np.quantile(finite, 1 - SCALE_QUANTILE)) < -0.1 * reach
+    return (-reach if has_negatives else 0.0), reach
 
 
 def bin_peaks(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: int) -> Floats:

@@ -43,6 +43,10 @@ class MLflow:
     """An MLflow run. An existing run of the same name is resumed without repeating its steps."""
 
     def __init__(self, place: str) -> None:
+        """Connect to the server or file ``place``, or that of the environment if it is "".
+
+        Raises `TacpipeError` if the package for a database is missing.
+        """
         for name, value in _DEFAULTS.items():
             os.environ.setdefault(name, value)
         from mlflow import MlflowClient
@@ -58,7 +62,7 @@ class MLflow:
         self._steps: dict[str, int] = {}  # last step of each metric in a resumed run
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Create the run, or resume the one with this name."""
+        """Create the run, or resume the one with this name. Returns a text with the place of the run."""
         from mlflow.entities import Param
 
         experiment_name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or MLFLOW_EXPERIMENT
@@ -92,6 +96,7 @@ class MLflow:
         self._client.set_terminated(self._run, "FINISHED" if path is not None else "KILLED")
 
     def _log(self, metrics: Mapping[str, float], step: int) -> None:
+        """Log metrics at a step, unless there are none."""
         from mlflow.entities import Metric
 
         now_ms = time.time_ns() // 1_000_000
@@ -107,6 +112,7 @@ class TensorBoard:
     """A run with scalars by epoch, and params as text and in TensorBoard's table of hyperparameters."""
 
     def __init__(self, place: str) -> None:
+        """Prepare the folder ``place``, "" for the default. Raises ``ImportError`` if tensorboardX is missing."""
         import tensorboardX  # noqa: F401  (a module that is missing is reported before anything is computed)
 
         self._folder = Path(place or TENSORBOARD_FOLDER)
@@ -115,7 +121,7 @@ class TensorBoard:
         self._epoch = 0
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Start the run's event file, which supersedes older files of this run."""
+        """Start the run's event file, which supersedes older files of this run. Returns a text with its folder."""
         from tensorboardX import SummaryWriter
 
         folder, self._params = self._folder / name, params
@@ -135,7 +141,7 @@ class TensorBoard:
         self._writer.flush()
 
     def end(self, path: Path | None, figures: Mapping[str, float]) -> None:
-        """Add the figures, the row of hyperparameters and the path."""
+        """Add the figures, the row of hyperparameters and the path, unless that is None, and close the event file."""
         from tensorboardX.summary import hparams
 
         assert self._writer is not None
@@ -157,6 +163,7 @@ class Wandb:
     """A Weights & Biases run named after its result, so that an interrupted run is continued."""
 
     def __init__(self, place: str) -> None:
+        """Prepare runs in the folder ``place``, "" for the default. Raises ``ImportError`` if wandb is missing."""
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         import wandb  # noqa: F401  (a module that is missing is reported before anything is computed)
 
@@ -164,7 +171,7 @@ class Wandb:
         self._run: Any = None
 
     def start(self, name: str, params: Mapping[str, Scalar]) -> str:
-        """Start the run, or continue the one with this name."""
+        """Start the run, or continue the one with this name. Returns its address or its folder."""
         import wandb
 
         mode: Any = os.environ.get("WANDB_MODE") or "offline"

@@ -89,6 +89,7 @@ def _is_number(value: object) -> bool:
 
 
 def _leaves(value: Json, between: str, name: str = "") -> Iterable[tuple[str, Scalar]]:
+    """Yield the path, joined with ``between``, and the scalar of each entry in nested values; lists are joined as text."""
     for key, entry in value.items():
         path = f"{name}{between}{key}" if name else str(key)
         if isinstance(entry, Mapping):
@@ -230,7 +231,7 @@ class Tracking:
 
 
 def _rate(model_params: Mapping[str, Scalar], epoch: int) -> float | None:
-    """Return the learning rate of an epoch of a stored model, or None if its params lack it."""
+    """Return the learning rate of an epoch of a stored model, or None if its params do not determine it."""
     peak, epochs = model_params.get("learning_rate"), model_params.get("epochs")
     if not isinstance(peak, int | float) or not isinstance(epochs, int) or epochs < 1:
         return None
