@@ -98,7 +98,7 @@ class Comparison:
         return headline(self.best, self) if self.best else None
 
     def frame(self) -> pd.DataFrame:
-        """Return one row per predictor: part, target, name, kind, settings, errors, baseline, gain, interval, p, n."""
+        """Return one row per predictor: part, target, name, kind, settings, errors, baseline, gain, interval, p, counts."""
         import pandas as pd
 
         names = list(dict.fromkeys(name for row in self.rows for name in row.differing))
@@ -143,13 +143,11 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
 
 def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]:
     """Return one comparison per question and unit of its errors, with questions in the order of the runs."""
-    questions = questions_of([run for method in methods for run in method.runs])
-    answers = [
-        compare_on(task, alike, question)
-        for question in questions
-        for alike in _group_by_unit(methods, question).values()
-    ]
-    return [comparison for comparison in answers if comparison.rows]
+    all_comparisons = []
+    for question in questions_of([run for method in methods for run in method.runs]):
+        groups = _group_by_unit(methods, question).values()
+        all_comparisons += [compare_on(task, same_unit, question) for same_unit in groups]
+    return [comparison for comparison in all_comparisons if comparison.rows]
 
 
 def _group_by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Method]]:
@@ -175,53 +173,48 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
     Baselines, oracles and controls are taken from one method's runs (`reference`), because they are equal for all
     methods of a split; variants of the model are included for each method.
     """
-    evaluated = [evaluated_method for evaluated_method in methods if evaluated_method.of(question)]
+    evaluated = [method for method in methods if method.of(question)]
     measure = evaluated[0].of(question)[0].questions[question].measure
     source = reference(task, evaluated, question, measure)
     entries: list[tuple[str, Kind, str, Method]] = []
     sources: dict[str, Method] = {}
-    for evaluated_method in [source, *evaluated]:
-        for predictor in evaluated_method.predictors(question):
-            sources.setdefault(predictor, evaluated_method)
-    for evaluated_method in evaluated:
-        for predictor in evaluated_method.predictors(question):
+    for method in [source, *evaluated]:
+        for predictor in method.predictors(question):
+            sources.setdefault(predictor, method)
+    for method in evaluated:
+        for predictor in method.predictors(question):
             kind = task.kind(predictor)
-            if kind == "model" and evaluated_method.control:
-                entries.append((evaluated_method.name, "control", predictor, evaluated_method))
-            elif kind == "model" or kind == "variant":
-                name = (
-                    evaluated_method.name
-                    if kind == "model"
-                    else f"{evaluated_method.name} · {task.predictor_name(predictor)}"
-                )
-                entries.append((name, kind, predictor, evaluated_method))
-            elif evaluated_method is sources[predictor]:
-                entries.append((task.predictor_name(predictor), kind, predictor, evaluated_method))
+            if kind == "model":
+                entries.append((method.name, "control" if method.control else kind, predictor, method))
+            elif kind == "variant":
+                entries.append((f"{method.name} · {task.predictor_name(predictor)}", kind, predictor, method))
+            elif method is sources[predictor]:
+                entries.append((task.predictor_name(predictor), kind, predictor, method))
     ranked = [_rank_baselines(task, method, source, question, predictor) for _, _, predictor, method in entries]
     picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
               if kind == "model" and pairs]  # fmt: skip
     rows = [_row(*entry, question, measure, pairs, picked) for entry, pairs in zip(entries, ranked, strict=True)]
     sign = -1 if measure.rises else 1
 
-    def place(row: ComparisonRow) -> tuple[bool, float, str]:
+    def best_first(row: ComparisonRow) -> tuple[bool, float, str]:
         return math.isnan(row.score.mean), sign * row.score.mean, row.name
 
-    return Comparison(task.name, question, measure, tuple(sorted(rows, key=place)))
+    return Comparison(task.name, question, measure, tuple(sorted(rows, key=best_first)))
 
 
 def reference(task: TaskReport, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
     """Return the method whose baselines are reported: the one with most baselines, then most runs, then the lowest error."""
 
-    def place(method: Method) -> tuple[int, int, float]:
+    def rank(method: Method) -> tuple[int, int, float]:
         counted = sum(task.kind(name) not in ("model", "variant") for name in method.predictors(question))
         error = float(measure.error(sum(method.sums(question).values())[None])[0])  # type: ignore[index]
         return counted, len(method.of(question)), -error
 
-    return max(methods, key=place)
+    return max(methods, key=rank)
 
 
 def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
-    """Return a method's row as a headline, with all baselines that it was compared with."""
+    """Return a method's row as a headline, with all baselines that it was compared with; None without recordings."""
     question, method = comparison.question, row.method
     source = next((row.method for row in comparison.rows if row.kind == "baseline"), method)
     task = report_on(comparison.task)
@@ -273,9 +266,9 @@ def _row(
     pairs: Mapping[str, Pair],
     picked: Sequence[Pair],
 ) -> ComparisonRow:
-    """Return the row of a predictor. ``pairs``: with its baselines.
+    """Return the row of a predictor. ``pairs``: with its baselines, the best first.
 
-    ``picked``: those of all methods with the best baseline.
+    ``picked``: those of all methods with the best baseline, from which the best method may have been selected.
     """
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
@@ -362,8 +355,8 @@ def paired_runs(
         if len(common) > 1:
             pairs = [(first_scores[key], second_scores[key]) for key in common]
             gains = [mine - yours for mine, yours in pairs]
-            alike = max(gains) - min(gains) < 1e-12 * max(map(abs, (*gains, 1.0)))
-            return PairedRuns(unit, len(pairs), math.nan if alike else paired_t(*zip(*pairs, strict=True)).p)
+            are_equal = max(gains) - min(gains) < 1e-12 * max(map(abs, (*gains, 1.0)))
+            return PairedRuns(unit, len(pairs), math.nan if are_equal else paired_t(*zip(*pairs, strict=True)).p)
     return PairedRuns("folds", 0, math.nan)
 
 

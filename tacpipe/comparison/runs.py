@@ -65,17 +65,19 @@ def distinct_names(
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
     """
-    alike: dict[str, list[Settings]] = {}
+    settings_by_name: dict[str, list[Settings]] = {}
     for name, settings in methods:
-        alike.setdefault(name, []).append(settings)
+        settings_by_name.setdefault(name, []).append(settings)
     distinct: list[tuple[str, Settings]] = []
-    for first, settings in methods:
+    for first_name, settings in methods:
         differing = {
             name: value
             for name, value in settings.items()
-            if name not in usual and (name, value) not in usual and any(run.get(name) != value for run in alike[first])
+            if name not in usual
+            and (name, value) not in usual
+            and any(run.get(name) != value for run in settings_by_name[first_name])
         }
-        distinct.append((" · ".join([first, *marks(differing)]), differing))
+        distinct.append((" · ".join([first_name, *marks(differing)]), differing))
     return distinct
 
 
@@ -85,11 +87,13 @@ def marks(differing: Settings) -> list[str]:
     >>> marks({"width": 8, "deep": True, "of": ""})
     ['deep', 'width 8']
     """
-    return [
-        f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
-        for name, value in sorted(differing.items())
-        if value != ""
-    ]
+    texts = []
+    for name, value in sorted(differing.items()):
+        if isinstance(value, bool):
+            texts.append(name if value else f"no {name}")
+        elif value != "":
+            texts.append(f"{name} {value}")
+    return texts
 
 
 MODEL = "model"  # name of a run's own predictor
@@ -187,11 +191,11 @@ class Method(Generic[Details]):
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
         """Return the error sums of a predictor by seed and recording; runs with the same seed are added."""
-        return pairing.add_by_key(
-            ((run.seed, name), run_sums)
-            for run in self.of(question)
-            for name, run_sums in run.questions[question].sums.get(predictor, {}).items()
-        )
+        parts = []
+        for run in self.of(question):
+            sums_by_recording = run.questions[question].sums.get(predictor, {})
+            parts += [((run.seed, name), sums) for name, sums in sums_by_recording.items()]
+        return pairing.add_by_key(parts)
 
     def predictors(self, question: Question) -> list[str]:
         """Return the predictors of all of its runs, in order of appearance."""

@@ -42,7 +42,10 @@ def open_camera(target: str, sensor: Sensor, name: str) -> CameraLink:
 
 
 def _serial(target: str, serials: list[str], name: str) -> str:
-    """Return the serial number of the camera at ``target``, which is an index or a serial number."""
+    """Return the serial number of the camera at ``target``, which is an index or a serial number.
+
+    Raises `UsageError` for another target, and `DeviceError` if the camera is not connected.
+    """
     if target in serials:
         return target
     if not target.isdigit():
@@ -70,6 +73,10 @@ class CameraLink(OpenLink):
         self._unit_m = 1 / float(metadata.depth_scale)  # RealSense reports counts per metre
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the next image as a depth frame, or nothing after ``timeout_s``.
+
+        Raises `LinkLostError` without the camera.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
             try:

@@ -57,7 +57,7 @@ def open_can(target: str, sensor: Sensor, name: str) -> CanLink:
 
 
 def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusABC:
-    """Open an slcan adapter that adds damaged lines to ``damaged`` as (UTC in ns, bytes).
+    """Return an open slcan adapter that adds damaged lines to ``damaged`` as (UTC in ns, bytes).
 
     For some damaged lines python-can raises an error; others it drops, or reads as shorter frames.
     """
@@ -115,10 +115,11 @@ def parse_bus(target: str) -> tuple[str, str, int | None]:
             f"can:{target} is not a CAN bus; write can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of the "
             f"kinds {', '.join(KINDS)}."
         )
-    return kind, channel, int(bitrate) if at else None
+    return kind, channel, (int(bitrate) if at else None)
 
 
 def _open_error(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
+    """Return the error for a bus that cannot be opened, with advice for its kind."""
     if kind == "slcan":
         cause = error if isinstance(error, OSError) else error.__cause__ or error.__context__
         return ports.open_error(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
@@ -151,31 +152,36 @@ class CanLink(OpenLink):
         self._arrivals = Arrivals()
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the frames that arrived within ``timeout_s``, and damaged lines.
+
+        Raises `LinkLostError` without the adapter.
+        """
         import can
 
         entries: Arrived = []
         try:
             message = self.bus.recv(timeout_s)
             while message is not None:
-                entries += self._damaged_lines()
+                entries += self._take_damaged_lines()
                 if not message.is_error_frame and not message.is_remote_frame and len(message.data) <= 8:
                     self._arrivals.read_clocks()
                     entries.append((self._arrivals.to_monotonic(int(message.timestamp * 1e9)), pack_frame(message)))
                 message = self.bus.recv(0)
-            entries += self._damaged_lines()
+            entries += self._take_damaged_lines()
         except (can.CanError, OSError, ValueError) as error:
             if not entries:
                 raise self.lost(str(error)) from error
         return entries
 
-    def _damaged_lines(self) -> Arrived:
-        """Return the damaged lines since the last call."""
+    def _take_damaged_lines(self) -> Arrived:
+        """Return the damaged lines since the last call, with their arrivals."""
         lines, self._damaged[:] = list(self._damaged), []
         if lines:
             self._arrivals.read_clocks()
         return [(self._arrivals.to_monotonic(utc_ns), line) for utc_ns, line in lines]
 
     def _send(self, data: bytes) -> None:
+        """Send the frames in ``data``. Raises `LinkLostError` if the bus fails."""
         import can
 
         try:
@@ -185,6 +191,7 @@ class CanLink(OpenLink):
             raise self.lost(str(error)) from error
 
     def _release(self) -> None:
+        """Close the bus, and the serial port of an adapter that was unplugged."""
         import can
 
         try:
@@ -203,7 +210,7 @@ def pack_frame(message: can.Message) -> bytes:
 
 
 def unpack_frames(data: bytes) -> list[can.Message]:
-    """Decode CAN frames from ``data``, 13 bytes per frame."""
+    """Return the CAN frames in ``data``, 13 bytes per frame."""
     import can
 
     return [

@@ -42,6 +42,7 @@ class FolderLink(OpenLink):
     packets = True
 
     def __init__(self, name: str, folder: Path, existing: dict[str, FileState]) -> None:
+        """Watch a folder whose ``existing`` files are not delivered."""
         super().__init__(name)
         self.folder = folder
         self._delivered = existing  # states of files when they were delivered, or when the watch started
@@ -50,15 +51,22 @@ class FolderLink(OpenLink):
         self._wake_event = threading.Event()
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the files that become complete within ``timeout_s``.
+
+        Raises `LinkLostError` if the folder cannot be read.
+        """
         deadline = time.monotonic() + timeout_s
         while True:
-            entries = self._complete_files()
+            entries = self._take_complete_files()
             left_s = deadline - time.monotonic()
             if entries or left_s <= 0 or self._wake_event.wait(min(SCAN_S, left_s)):
                 return entries
 
-    def _complete_files(self) -> Arrived:
-        """Return the content of the files that became complete, in order of their last change."""
+    def _take_complete_files(self) -> Arrived:
+        """Return the content of the files that became complete, in order of their last change.
+
+        Raises `LinkLostError` if the folder cannot be read.
+        """
         try:
             states = _file_states(self.folder)
         except OSError as error:
@@ -110,17 +118,15 @@ def _read_complete(path: Path, state: FileState) -> bytes | None:
             status = os.fstat(file.fileno())
     except OSError:
         return None
-    return (
-        data if (status.st_ino, status.st_size, status.st_mtime_ns) == state and len(data) == status.st_size else None
-    )
+    is_same = (status.st_ino, status.st_size, status.st_mtime_ns) == state and len(data) == status.st_size
+    return data if is_same else None
 
 
 def _is_open_for_writing(fileno: int) -> bool:
     """Return whether a process has the file open for writing. Only then does Linux refuse a read lease with EAGAIN."""
     try:
-        fcntl.fcntl(
-            fileno, fcntl.F_SETSIG, signal.SIGURG
-        )  # SIGURG is ignored by default; a broken lease would otherwise send SIGIO
+        # SIGURG is ignored by default; a broken lease would otherwise send SIGIO
+        fcntl.fcntl(fileno, fcntl.F_SETSIG, signal.SIGURG)
         fcntl.fcntl(fileno, fcntl.F_SETLEASE, fcntl.F_RDLCK)
     except BlockingIOError:
         return True

@@ -66,6 +66,7 @@ def choose_interface(target: str, interfaces: list[HidInterface], usage_page: in
 
 
 def _matches(info: HidInterface, device: str, options: dict[str, str]) -> bool:
+    """Return whether an interface is the one with this path, or vendor and product, and has the values in ``options``."""
     if info["path"].decode() != device and f"{info['vendor_id']:04x}:{info['product_id']:04x}" != device.lower():
         return False
     return (
@@ -76,6 +77,7 @@ def _matches(info: HidInterface, device: str, options: dict[str, str]) -> bool:
 
 
 def _open_error(path: str, info: HidInterface, name: str) -> DeviceError:
+    """Return the error for a device that cannot be opened, with the rule that permits it."""
     if os.access(path, os.R_OK | os.W_OK):
         return DeviceError(f"{name}: {path} cannot be opened; unplug the device and plug it in again.")
     rule = (
@@ -99,6 +101,7 @@ class HidLink(OpenLink):
         self.reports = parse_report_descriptor(_descriptor(device))
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the reports that arrived within ``timeout_s``. Raises `LinkLostError` without the device."""
         deadline = time.monotonic() + timeout_s
         entries: Arrived = []
         try:
@@ -116,6 +119,7 @@ class HidLink(OpenLink):
         return entries
 
     def _send(self, data: bytes) -> None:
+        """Send a report. Raises `LinkLostError` if the device is gone or refuses it."""
         prefix = b"" if self.reports.has_numbers else b"\0"  # hidapi requires a report number; 0 means none
         try:
             sent = self.device.write(prefix + data)

@@ -84,7 +84,7 @@ class Link(Protocol):
 
 
 def parse(text: str) -> Address:
-    """Parse the address of a device, as in a rig file or on a command line.
+    """Return the address of a device that is given as in a rig file or on a command line.
 
     Raises `UsageError` for an unknown kind of link, or an empty or unprintable target.
 
@@ -185,6 +185,7 @@ class DescriptorLink(OpenLink):
     """A link over a non-blocking file descriptor. Each wake-up of ``poll`` is followed by one read."""
 
     def __init__(self, name: str, fileno: int, *extra_filenos: int) -> None:
+        """Poll the descriptor ``fileno`` and further ones that end a wait."""
         super().__init__(name)
         self._fileno = fileno
         self._wake_reader, self._wake_writer = os.pipe()
@@ -201,7 +202,10 @@ class DescriptorLink(OpenLink):
         raise NotImplementedError
 
     def _read_available(self, end: str, *check: str, max_bytes: int = MAX_READ) -> bytes:
-        """Return the bytes that have arrived. Raises `LinkLostError` at their end, with ``end`` as its reason."""
+        """Return the bytes that have arrived, none if there are none.
+
+        Raises `LinkLostError` at their end, with ``end`` as its reason and ``check`` as what to check.
+        """
         try:
             data = os.read(self._fileno, max_bytes)
         except BlockingIOError:
@@ -213,6 +217,7 @@ class DescriptorLink(OpenLink):
         return data
 
     def _send(self, data: bytes) -> None:
+        """Write all bytes. Raises `LinkLostError` if the device accepts none for `WRITE_S` or is gone."""
         remaining, start_s = memoryview(data), time.monotonic()
         while remaining:
             try:

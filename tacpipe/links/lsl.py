@@ -70,6 +70,8 @@ def silence_logging(pylsl: Any) -> None:
 def _parse_query(target: str) -> Mapping[str, str]:
     """Return the properties that a matching stream must have.
 
+    Raises `UsageError` for unknown keys, quotes or no property.
+
     >>> _parse_query("wrist"), _parse_query("?type=Force&source_id=ft-7")
     ({'name': 'wrist'}, {'type': 'Force', 'source_id': 'ft-7'})
     """
@@ -107,7 +109,7 @@ def _no_single_outlet(pylsl: Any, outlets: list[Any]) -> str:
 
 
 def _check_description(text: str, sensor: Sensor, name: str) -> str:
-    """Return the description of a stream. Raises `DeviceError` if it contradicts the rig file."""
+    """Return the description of a stream, ``text``. Raises `DeviceError` if it is invalid or contradicts the rig file."""
     try:
         description = descriptions.parse(text)
     except TacpipeError as error:
@@ -128,6 +130,7 @@ class LslLink(OpenLink):
     packets = True
 
     def __init__(self, name: str, inlet: Any, description: str, pylsl: Any) -> None:
+        """Wrap an open inlet with the XML ``description`` of its stream, and start to measure its clock."""
         super().__init__(name)
         self.inlet, self._pylsl = inlet, pylsl
         self._description: bytes | None = lsl.DESCRIPTION + description.encode()
@@ -137,6 +140,7 @@ class LslLink(OpenLink):
         self._clock_thread.start()
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the description once, then the samples that arrived. Raises `LinkLostError` if the outlet ended."""
         if self._description is not None:
             packet, self._description = self._description, None
             return [(time.monotonic_ns(), packet)]
@@ -153,6 +157,7 @@ class LslLink(OpenLink):
         return entries
 
     def _packet(self, values: Any, stamps: Any) -> bytes:
+        """Return the packet of samples, texts as UTF-8, with their stamps and the offset of the clock."""
         rows = np.asarray(values)
         if rows.dtype.kind == "O":
             flat = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in rows.ravel()]

@@ -76,17 +76,17 @@ class MultipartParser:
         self._head: Head | None = None  # head of the image that is being received
 
     def feed(self, data: bytes) -> list[tuple[Head, bytes]]:
-        """Return the newly completed images, each with the fields of its head."""
+        """Add bytes and return the newly completed images, each with the fields of its head."""
         self._bytes += data
-        if self.boundary is None and not self._begin():
+        if self.boundary is None and not self._take_response_head():
             return []
         images: list[tuple[Head, bytes]] = []
-        while not self.fault and (image := self._next_image()) is not None:
+        while not self.fault and (image := self._take_image()) is not None:
             images.append(image)
         return images
 
-    def _begin(self) -> bool:
-        """Read the head of the response; return whether images follow."""
+    def _take_response_head(self) -> bool:
+        """Take the head of the response, and return whether images follow; a wrong head sets ``fault``."""
         head = self._take_head()
         if head is None:
             return False
@@ -99,7 +99,7 @@ class MultipartParser:
         return True
 
     def _take_head(self) -> Head | None:
-        """Remove and return the head at the start of the bytes, or None if it is incomplete."""
+        """Remove and return the head at the start of the bytes, or None if it is incomplete; a long one sets ``fault``."""
         stop = self._bytes.find(HEAD_END)
         if stop < 0:
             if len(self._bytes) > MAX_HEAD_BYTES:
@@ -110,8 +110,11 @@ class MultipartParser:
         fields = (line.partition(":") for line in lines[1:])
         return {"": lines[0]} | {key.strip().lower(): value.strip() for key, _, value in fields}
 
-    def _next_image(self) -> tuple[Head, bytes] | None:
-        """Remove and return the image at the start of the bytes, or None if it is incomplete."""
+    def _take_image(self) -> tuple[Head, bytes] | None:
+        """Remove and return the head and the image at the start of the bytes, or None if they are incomplete.
+
+        A large image sets ``fault``.
+        """
         assert self.boundary is not None
         if self._head is None:
             start = self._bytes.find(self.boundary)
@@ -131,7 +134,7 @@ class MultipartParser:
         head, image = self._head, bytes(self._bytes[:size])
         del self._bytes[:size]
         self._head = None
-        return head, image if stated.isdigit() else image.rstrip(b"\r\n")
+        return head, (image if stated.isdigit() else image.rstrip(b"\r\n"))
 
 
 class MjpegLink(DescriptorLink):
@@ -156,6 +159,7 @@ class MjpegLink(DescriptorLink):
         return self._entries(images) if images else super()._receive(timeout_s)
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        """Return the images that have arrived. Raises `LinkLostError` if the server ended or sends something else."""
         server = "the program that serves the images"
         images = self._parser.feed(
             self._read_available("the server ended the connection", server, max_bytes=READ_BYTES)
@@ -165,6 +169,7 @@ class MjpegLink(DescriptorLink):
         return self._entries(images)
 
     def _entries(self, images: list[tuple[Head, bytes]]) -> Arrived:
+        """Return frames of images with increasing numbers, after the settings before the first of them."""
         t_ns = time.monotonic_ns()
         entries: Arrived = []
         for head, image in images:

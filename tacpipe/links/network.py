@@ -96,8 +96,8 @@ def open_udp(target: str, sensor: Sensor, name: str) -> UdpLink:
     from the first sender. Raises `UsageError` for another option, and `DeviceError` if a local port is in use or the host is
     unknown or unreachable.
     """
-    target, _, option = target.partition("?")
-    host, port = parse_host_port("udp", target)
+    host_and_port, _, option = target.partition("?")
+    host, port = parse_host_port("udp", host_and_port)
     if not host or sensor.listens:
         sender = _parse_sender(option, name)
         return UdpLink(name, bind_port(host, port, name), prompt=needs_prompt_reads(sensor), sender=sender)
@@ -156,6 +156,7 @@ def needs_prompt_reads(sensor: Sensor) -> bool:
 
 
 def _prepare(port_socket: socket.socket) -> None:
+    """Make a socket non-blocking, with a large queue, and the kernel's timestamps and counts of drops if possible."""
     port_socket.setblocking(False)
     for option, value in ((socket.SO_RCVBUF, QUEUE_BYTES), (FORCED_QUEUE, QUEUE_BYTES), (STAMPS, 1), (DROPS, 1)):
         try:
@@ -172,6 +173,7 @@ class UdpLink(DescriptorLink):
     def __init__(
         self, name: str, port: socket.socket, *, prompt: bool, connected: bool = False, sender: str = ""
     ) -> None:
+        """Wrap a socket; ``prompt`` reads without a wait, ``connected`` sends to the peer, only ``sender`` is accepted."""
         super().__init__(name, port.fileno())
         self.socket = port
         self._prompt, self._connected = prompt, connected
@@ -210,6 +212,7 @@ class UdpLink(DescriptorLink):
         self._linger_s = LIVE_LINGER_S
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the datagrams that arrived within ``timeout_s``. Raises a `LinkLostError` of an earlier read."""
         entries = super()._receive(timeout_s) if self._failed is None else []
         if self._failed is not None and not entries:  # otherwise the next read reports the loss
             failed, self._failed = self._failed, None
@@ -217,6 +220,7 @@ class UdpLink(DescriptorLink):
         return entries
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        """Return the queued datagrams with their arrivals on the monotonic clock."""
         if not self._prompt:
             time.sleep(self._linger_s)
         queued = self._read_queue()
@@ -248,6 +252,7 @@ class UdpLink(DescriptorLink):
         return entries
 
     def _accepts(self, sender: Any) -> bool:
+        """Return whether datagrams of a sender are accepted; the first sender becomes the only one for `FIRST`."""
         if not self._accepted_sender:
             return True
         host = str(sender[0]).partition("%")[0]  # without the interface of a link-local address
@@ -273,6 +278,10 @@ class UdpLink(DescriptorLink):
         return time.time_ns() if wall_ns is None else wall_ns
 
     def _send(self, data: bytes) -> None:
+        """Send a datagram to the peer, or to the last sender.
+
+        Raises `DeviceError` if there is none, `LinkLostError` if it fails.
+        """
         if not self._connected and self._sender is None:
             raise DeviceError(
                 f"{self.name}: nothing was received yet, so the address to send to is unknown. Start the sender first."
@@ -329,6 +338,7 @@ class ControlledLink(UdpLink):
         self._poll.register(control.socket.fileno(), select.POLLIN)
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        """Return the queued datagrams; the end of the control connection is stored for the next read."""
         if any(fileno == self.control.socket.fileno() for fileno, _ in ready):
             try:
                 self.control.read(0)  # after the dialogue, all that can arrive here is the end of the connection

@@ -79,9 +79,9 @@ def _wait_for_reply(link: Link, ask: Ask, received: Arrived, stream: str) -> tup
     deadline = time.monotonic() + ask.timeout_s
     searched, timed_out = 0, False
     while True:
-        match = _find_reply(ask, received, searched, packets=bool(getattr(link, "packets", False)))
-        if match is not None:
-            return match
+        reply_and_before = _find_reply(ask, received, searched, packets=bool(getattr(link, "packets", False)))
+        if reply_and_before is not None:
+            return reply_and_before
         if timed_out:
             raise NoReplyError(ask, received, stream)
         searched = len(received)
@@ -130,6 +130,7 @@ def _pause(link: Link, pause_s: float) -> Arrived:
 
 
 def _no_reply_text(ask: Ask, received: Arrived, stream: str) -> str:
+    """Return the error for a reply that did not arrive: what was awaited, and what was received instead."""
     count = sum(len(data) for _, data in received)
     first = b"".join(data for _, data in received)[:QUOTED]
     instead = f"{count} other bytes were received, starting with {first.hex(' ')}" if count else "nothing was received"

@@ -111,9 +111,9 @@ def hid_module() -> Any:
     try:
         module = importlib.import_module(name)
     except ImportError as error:
-        absent = extras.missing(error, "A HID device")
-        if absent is not None and importlib.util.find_spec("hid") is None:
-            raise absent from error
+        missing_error = extras.missing(error, "A HID device")
+        if missing_error is not None and importlib.util.find_spec("hid") is None:
+            raise missing_error from error
     if hasattr(module, "device"):
         return module
     raise DeviceError(
@@ -152,6 +152,7 @@ def describe_holders(holders: list[str]) -> str:
 
 
 def _find_processes(targets: set[str]) -> list[str]:
+    """Return the names of other processes with one of these files or sockets open."""
     return [
         f"{_name(process)} (process {process.name})"
         for process in sorted(PROCESSES.glob("[0-9]*"), key=lambda path: int(path.name))
@@ -160,6 +161,7 @@ def _find_processes(targets: set[str]) -> list[str]:
 
 
 def _open_files(process: Path) -> set[str]:
+    """Return the targets of a process's open files; empty if it is not permitted to read them."""
     targets: set[str] = set()
     try:
         for file in (process / "fd").iterdir():
@@ -220,6 +222,7 @@ def open_error(error: OSError, target: str, name: str) -> DeviceError:
 
 
 def _open_port(target: str, baud: int, line: SerialLine, name: str) -> serial.Serial:
+    """Return an open serial port. Raises `UsageError` for a wrong baud rate, and `DeviceError` if it cannot be opened."""
     with extras.explain_missing(name):
         import serial
 

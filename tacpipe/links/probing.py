@@ -36,6 +36,7 @@ class SensorCandidate:
     options: Options = field(default_factory=dict)
 
     def __str__(self) -> str:
+        """Return the kind with its options, lists by their length."""
         options = ", ".join(
             f"{len(value)} {name}" if isinstance(value, list) else f"{name} = {value}"
             for name, value in self.options.items()
@@ -66,6 +67,7 @@ class Finding:
         return max(0.0, self.explained - self.chance)
 
     def __str__(self) -> str:
+        """Return the candidate with its evidence: frames, rate, and fractions of bytes in frames."""
         rate = f" at {self.rate_hz:.4g} Hz" if self.rate_hz else ""
         by_size = "only by the size of the packets"
         chance = by_size if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
@@ -98,16 +100,16 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | No
     """
     if not data.data:
         return []
-    data = _truncate(data)
-    shuffled, noise = _shuffle(data), _noise(data)
+    sample = _truncate(data)
+    shuffled, noise = _shuffle(sample), _noise(sample)
     findings = []
-    for candidate in candidates(data, scheme) if sensors is None else sensors:
-        frames, part, rate_hz = _count_frames(candidate.sensor, data)
+    for candidate in candidates(sample, scheme) if sensors is None else sensors:
+        frames, part, rate_hz = _count_frames(candidate.sensor, sample)
         if frames < MIN_FRAMES or part < POSSIBLE:
             continue
         # Shuffled digits are still lines of numbers, so sensors that are described by the bytes use random bytes.
         _, chance, _ = _count_frames(candidate.sensor, noise if candidate.sensor.described else shuffled)
-        finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
+        finding = Finding(candidate, frames, rate_hz, len(sample.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
             findings.append(finding)
     return sorted(findings, key=_rank)
@@ -208,7 +210,7 @@ def probe(address: Address, usb_id: str = "", *, passive: bool = False, progress
 
 
 def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Report:
-    """Return the findings without sending anything, at each likely baud rate until the sensor is identified."""
+    """Return the best report of listening only, at each likely baud rate until the sensor is identified."""
     best = Report(str(address))
     for number, baud in enumerate(_bauds(usb_id) if address.scheme == "serial" else [0]):
         progress(f"{address}: listening{f' at {baud:,} baud' if baud else ''}")
@@ -225,7 +227,7 @@ def _probe_by_listening(address: Address, usb_id: str, progress: Progress) -> Re
 
 
 def _probe_with_requests(address: Address, usb_id: str, progress: Progress) -> Report:
-    """Return the best findings after each driver's opening requests. Drivers with this USB id are tried first."""
+    """Return the best report after each driver's opening requests. Drivers with this USB id are tried first."""
     best = Report(str(address))
     for candidate in _sort_by_usb_id(candidates(Chunks.from_pairs([]), address.scheme), usb_id):
         sensor = candidate.sensor
@@ -261,6 +263,7 @@ def _request_frames(link: Link, sensor: Sensor) -> Arrived:
 
 
 def _listen(link: Link, first_s: float) -> Arrived:
+    """Return what arrives within `LISTEN_S`, or nothing if no byte arrives within ``first_s``."""
     entries = link.read(first_s)
     deadline = monotonic() + LISTEN_S
     while entries and (left_s := deadline - monotonic()) > 0:

@@ -87,7 +87,7 @@ class V4l2Device:
 
     @property
     def card(self) -> tuple[str, str, bool]:
-        """The name of the camera, where it is plugged in, and whether it captures video in buffers."""
+        """The name of the camera, where it is plugged in, and whether it captures video in buffers. Raises ``OSError``."""
         _, card, bus, _, all_nodes, this_node = CAPABILITY.unpack(self.call(QUERYCAP, bytes(CAPABILITY.size)))
         capabilities = this_node if all_nodes & HAS_DEVICE_CAPS else all_nodes
         captures = capabilities & (CAN_CAPTURE | CAN_STREAM | IS_TOUCH) == CAN_CAPTURE | CAN_STREAM
@@ -164,6 +164,7 @@ def open_v4l2(place: str, sensor: Sensor, name: str) -> V4l2Link:
 
 
 def _find_device(place: str, name: str) -> str:
+    """Return the path of the only camera with a name. Raises `DeviceError` if none or several have it."""
     paths = [port.address.removeprefix("v4l2:") for port in cameras() if port.persistent_path == f"v4l2:{place}"]
     if len(paths) != 1:
         described = "no camera has" if not paths else f"{', '.join(paths)} have"
@@ -178,6 +179,7 @@ def _listed_cameras() -> str:
 
 
 def _refusal(path: str, error: OSError) -> str:
+    """Return why a camera did not start, with advice."""
     if error.errno == errno.EBUSY:
         return f"{path} is in use by {ports.describe_holders(ports.holders_of_file(path))}; end it."
     if error.errno in (errno.ENOTTY, errno.EINVAL):
@@ -206,30 +208,33 @@ class Capture:
 
 
 def _set_up(device: V4l2Device, sensor: Any, name: str) -> Capture:
-    """Set format, rate and controls from the sensor's options. Raises `DeviceError` if the camera refuses them."""
+    """Set format, rate and controls from the sensor's options, and return them as the camera has set them.
+
+    Raises `DeviceError` if the camera refuses format or size, `UsageError` for a control, and ``OSError`` if it fails.
+    """
     if not device.card[2]:
         raise OSError(errno.ENOTTY, "it does not capture video")
     encoding = getattr(sensor, "encoding", "mjpeg")
     if not hasattr(sensor, "encoding") and FOURCC["mjpeg"].decode() not in device.formats():  # a probe has no options
         encoding = "yuyv"
-    asked_px = getattr(sensor, "width_px", 0), getattr(sensor, "height_px", 0)
+    requested_px = getattr(sensor, "width_px", 0), getattr(sensor, "height_px", 0)
     _, width, height, *_ = FORMAT.unpack(device.call(G_FMT, FORMAT.pack(CAPTURE, *[0] * 8)))
     code = int.from_bytes(FOURCC[encoding], "little")
-    requested = FORMAT.pack(CAPTURE, asked_px[0] or width, asked_px[1] or height, code, 1, 0, 0, 0, 0)
-    _, width, height, got, *_ = FORMAT.unpack(device.call(S_FMT, requested))
-    if got != code:
+    requested = FORMAT.pack(CAPTURE, requested_px[0] or width, requested_px[1] or height, code, 1, 0, 0, 0, 0)
+    _, width, height, actual_code, *_ = FORMAT.unpack(device.call(S_FMT, requested))
+    if actual_code != code:
         raise DeviceError(
             f"{name}: the camera does not send {encoding}; it sends {', '.join(device.formats())}. Set encoding to mjpeg "
             f"for MJPG, or to yuyv for YUYV."
         )
-    if asked_px[0] and asked_px != (width, height):
+    if requested_px[0] and requested_px != (width, height):
         raise DeviceError(
-            f"{name}: the camera sends {width} x {height} pixels instead of {asked_px[0]} x {asked_px[1]}. Set width_px and "
-            f"height_px to a size that it has."
+            f"{name}: the camera sends {width} x {height} pixels instead of {requested_px[0]} x {requested_px[1]}. Set "
+            f"width_px and height_px to a size that it has."
         )
-    asked_hz = getattr(sensor, "rate_hz", 0.0)
-    if asked_hz:
-        device.call(S_PARM, RATE.pack(CAPTURE, 0, 0, 1000, round(asked_hz * 1000)))
+    requested_hz = getattr(sensor, "rate_hz", 0.0)
+    if requested_hz:
+        device.call(S_PARM, RATE.pack(CAPTURE, 0, 0, 1000, round(requested_hz * 1000)))
     numerator, denominator = RATE.unpack(device.call(G_PARM, bytes([CAPTURE]) + bytes(RATE.size - 1)))[3:]
     return Capture(
         encoding,
@@ -241,15 +246,18 @@ def _set_up(device: V4l2Device, sensor: Any, name: str) -> Capture:
 
 
 def _set_controls(device: V4l2Device, sensor: Any, encoding: str) -> str:
-    """Set the controls in the sensor's options, and return all controls with the values that were read back."""
+    """Set the controls in the sensor's options, and return all controls with the values that were read back.
+
+    Raises `UsageError` if a control cannot be set.
+    """
     requested: dict[int, int] = {}
-    for option, (control, automatic, off) in CONTROLS.items():
+    for option, (control, automatic_control, off_value) in CONTROLS.items():
         value = getattr(sensor, option, None)
         if value is None:
             continue
-        if automatic is not None:
+        if automatic_control is not None:
             with contextlib.suppress(OSError):  # many cameras lack the automatic control
-                device.write_control(automatic, off)
+                device.write_control(automatic_control, off_value)
         try:
             device.write_control(control, value)
         except OSError as error:
@@ -278,6 +286,7 @@ class V4l2Link(DescriptorLink):
     packets = True
 
     def __init__(self, name: str, device: V4l2Device, capture: Capture) -> None:
+        """Start to capture into buffers of the kernel, after the settings as the first entry."""
         self.device, self.capture = device, capture
         self._encoder = None
         if capture.encoding == "yuyv":
@@ -301,6 +310,7 @@ class V4l2Link(DescriptorLink):
         return pending or super()._receive(timeout_s)
 
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        """Return the frames in filled buffers, and queue the buffers again. Raises `LinkLostError` without the camera."""
         entries: Arrived = []
         for _ in range(BUFFERS):  # bounded, because frames can arrive as fast as they are encoded
             try:
@@ -316,7 +326,7 @@ class V4l2Link(DescriptorLink):
         return entries
 
     def _entry(self, filled: tuple[Any, ...]) -> tuple[int, bytes]:
-        """Return the frame of a buffer with its stamp."""
+        """Return the arrival of a filled buffer in ns and its frame."""
         index, _, size, flags, _, seconds, microseconds, _, number, *_ = filled
         now_us = time.monotonic_ns() // 1000
         t_us = min(seconds * 1_000_000 + microseconds, now_us) if flags & STAMP_KIND == MONOTONIC else now_us
@@ -328,6 +338,7 @@ class V4l2Link(DescriptorLink):
         return t_ns, pack_frame(Frame(number % COUNTS, t_ns // 1000, 0, content))
 
     def _encode(self, content: bytes) -> bytes:
+        """Return raw pixels as JPEG; an incomplete frame unchanged."""
         from tacpipe.plugins import extras
 
         with extras.explain_missing(ENCODED_BY):
@@ -352,6 +363,7 @@ class V4l2Link(DescriptorLink):
         self.device.call(QBUF, self._buffer(index))
 
     def _release(self) -> None:
+        """Stop the capture, and close buffers and device."""
         super()._release()
         with contextlib.suppress(OSError):  # it was unplugged
             self.device.call(STREAMOFF, struct.pack("<i", CAPTURE))

@@ -65,6 +65,10 @@ class WebsocketLink(OpenLink):
         self.connection = connection
 
     def _receive(self, timeout_s: float) -> Arrived:
+        """Return the messages that arrived within ``timeout_s``.
+
+        Raises `LinkLostError` if the other end closed the websocket.
+        """
         from websockets.exceptions import ConnectionClosed
 
         entries: Arrived = []
@@ -81,6 +85,7 @@ class WebsocketLink(OpenLink):
             raise self.lost(f"the other end closed the websocket ({error})") from error
 
     def _send(self, data: bytes) -> None:
+        """Send a message, as text if it is UTF-8. Raises `LinkLostError` if the other end closed the websocket."""
         from websockets.exceptions import ConnectionClosed
 
         try:

@@ -34,8 +34,8 @@ RANGE = 8.0  # range of the logarithm of a temperature, relative to the spread o
 
 def probabilities(scores: AnyFloats, temperature: float = 1.0) -> Floats:
     """Return the softmax of scores (slide, class) divided by a temperature; a score of minus infinity gets 0."""
-    wide = scores.astype(np.float64) / temperature
-    weights = np.exp(wide - wide.max(axis=1, keepdims=True))
+    scaled = scores.astype(np.float64) / temperature
+    weights = np.exp(scaled - scaled.max(axis=1, keepdims=True))
     softmax: Floats = weights / weights.sum(axis=1, keepdims=True)
     return softmax
 
@@ -50,14 +50,14 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
     finite = np.isfinite(scores)
     targets = np.zeros(scores.shape)
     targets[np.arange(len(labels)), labels] = 1.0
-    hedge = 1 / (len(labels) + 2)
-    targets = np.where(finite, (1 - hedge) * targets + hedge / finite.sum(axis=1, keepdims=True), 0)
+    smoothing = 1 / (len(labels) + 2)
+    targets = np.where(finite, (1 - smoothing) * targets + smoothing / finite.sum(axis=1, keepdims=True), 0)
     spread = float(np.std(scores[finite])) or 1.0
 
     from scipy.optimize import minimize_scalar  # slow to import, and not needed for quantiles
 
-    def loss(log: float) -> float:
-        logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), MIN_PROBABILITY))
+    def loss(log_temperature: float) -> float:
+        logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log_temperature)), MIN_PROBABILITY))
         return float(-(targets * logs).sum(axis=1).mean())
 
     optimum = minimize_scalar(loss, bounds=(-RANGE, RANGE), method="bounded", options={"xatol": 1e-4})
@@ -195,8 +195,8 @@ def measures_by_step(
         "coverage": _means_by_step(total.covered, total.values),
         "width": _means_by_step(total.width, total.values),
     }
-    for at, percent in enumerate(percents):
-        measures[f"below_q{percent}"] = _means_by_step(total.below[:, at], total.values)
+    for index, percent in enumerate(percents):
+        measures[f"below_q{percent}"] = _means_by_step(total.below[:, index], total.values)
     if len(recordings) > 1:
         low, high = _coverage_interval(recordings)
         measures["coverage_low"], measures["coverage_high"] = low, high
@@ -221,8 +221,8 @@ def _coverage_interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[s
         np.stack([np.append(getattr(recording, name), getattr(recording, name).sum()) for recording in recordings])
         for name in ("covered", "values")
     )
-    shares = intervals.share_interval(covered, values)
-    return _named_steps(shares.low), _named_steps(shares.high)
+    coverages = intervals.share_interval(covered, values)
+    return _named_steps(coverages.low), _named_steps(coverages.high)
 
 
 def _named_steps(values: AnyFloats) -> dict[str, float]:
@@ -283,7 +283,7 @@ def promised_quantile(scores: AnyFloats, groups: Ints, level: float, noun: str) 
 
 
 def highest_promised_level(groups: int) -> float:
-    """Return the highest level that can be promised with this number of calibration groups.
+    """Return the highest level that can be promised with this number of calibration groups, as a fraction.
 
     >>> highest_promised_level(4)
     0.8

@@ -81,11 +81,9 @@ class Headline:
     @property
     def interval(self) -> str:
         """The description of the interval."""
-        return (
-            f"95 % interval over {format_count(self.clusters, self.cluster)}"
-            f"{f' and {self.seeds} seeds' if self.seeds > 1 else ''}"
-            f"{f', the best of {self.methods} methods' if self.methods > 1 else ''}"
-        )
+        seeds = f" and {self.seeds} seeds" if self.seeds > 1 else ""
+        methods = f", the best of {self.methods} methods" if self.methods > 1 else ""
+        return f"95 % interval over {format_count(self.clusters, self.cluster)}{seeds}{methods}"
 
     def to_json(self) -> Json:
         """Return the headline as JSON, with its best baseline and verdict; undefined values are null."""
@@ -121,7 +119,9 @@ def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
     """
     if clusters < MIN_CLUSTERS or round(effective, 6) < MIN_CLUSTERS or math.isnan(low) or math.isnan(high):
         return NO_VERDICT
-    return BETTER if low > 0 else WORSE if high < 0 else UNCLEAR
+    if low > 0:
+        return BETTER
+    return WORSE if high < 0 else UNCLEAR
 
 
 def explain_no_verdict(clusters: int, cluster: str, effective: float) -> str:
@@ -174,10 +174,11 @@ def bounds(headline: Headline) -> str:
 
 
 def format_gain(value: float, measure: str = "skill") -> str:
-    """Format a gain with its sign."""
+    """Return a gain with its sign, "not defined" for NaN; ``measure`` is skill or points."""
     if math.isnan(value):
         return "not defined"
-    digits = 1 if measure == "points" else 3 if abs(value) < 10 else 0
+    skill_digits = 3 if abs(value) < 10 else 0
+    digits = 1 if measure == "points" else skill_digits
     return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
@@ -246,7 +247,7 @@ def _capitalize(words: str) -> str:
 
 
 def _to_json(value: Any) -> Any:
-    """Replace undefined numbers by null and round floats to 9 digits; more would differ between machines."""
+    """Return values for JSON: undefined numbers as null, floats with 9 digits; more would differ between machines."""
     if isinstance(value, dict):
         return {name: _to_json(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -294,17 +295,16 @@ def summarize(headlines: Sequence[Headline], names: Names = MappingProxyType({})
         "n": weakest.clusters,
     }
     # all targets have the same measure, so its name is omitted
-    targets = len({headline.target for headline in headlines}) > 1
-    for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
-        summary["_".join(place if targets else [*place, _to_identifier(headline.columns[-1])])] = headline.model.values[
-            -1
-        ]
-    for headline, place in zip(headlines, _distinct_names(headlines, names), strict=True):
+    has_targets = len({headline.target for headline in headlines}) > 1
+    for headline, prefix in zip(headlines, _distinct_names(headlines, names), strict=True):
+        name = "_".join(prefix if has_targets else [*prefix, _to_identifier(headline.columns[-1])])
+        summary[name] = headline.model.values[-1]
+    for headline, prefix in zip(headlines, _distinct_names(headlines, names), strict=True):
         reference = next((row for row in headline.baselines if row.name == headline.reference), None)
-        for at, column in enumerate(headline.columns if reference else ()):
+        for index, column in enumerate(headline.columns if reference else ()):
             if reference and column.startswith("MAE"):
-                summary["_".join([*place, _to_identifier(column)])] = headline.model.values[at]
-                summary["_".join([*place, reference.name, _to_identifier(column)])] = reference.values[at]
+                summary["_".join([*prefix, _to_identifier(column)])] = headline.model.values[index]
+                summary["_".join([*prefix, reference.name, _to_identifier(column)])] = reference.values[index]
     finite = {name: value for name, value in summary.items() if math.isfinite(value)}
     return {name: _round_float(value) for name, value in list(finite.items())[: MAX_NUMBERS - 1]}
 
@@ -319,13 +319,13 @@ def _distinct_names(headlines: Sequence[Headline], names: Names) -> list[list[st
     names_by_headline: list[list[str]] = [[] for _ in headlines]
     for texts in ([headline.target for headline in headlines], [headline.part for headline in headlines]):
         if len(set(texts)) > 1:
-            for place, text in zip(names_by_headline, texts, strict=True):
-                place.append(names.get(text) or _to_identifier(text))
+            for parts, text in zip(names_by_headline, texts, strict=True):
+                parts.append(names.get(text) or _to_identifier(text))
     return names_by_headline
 
 
 def _to_identifier(text: str) -> str:
-    """Convert text to an identifier.
+    """Return text as an identifier.
 
     >>> [_to_identifier(text) for text in ("vs persistence", "accuracy (%)", "RMSE (counts)", "unseen objects")]
     ['vs_persistence', 'accuracy', 'rmse', 'unseen_objects']

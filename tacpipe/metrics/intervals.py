@@ -68,9 +68,8 @@ class Jackknife:
 
     def interval(self) -> Interval:
         """Return the values with their intervals."""
-        half_width = (
-            np.array([student_quantile(freedom, (1 + COVERAGE) / 2) for freedom in self.freedom.tolist()]) * self.error
-        )
+        quantiles = [student_quantile(freedom, (1 + COVERAGE) / 2) for freedom in self.freedom.tolist()]
+        half_width = np.array(quantiles) * self.error
         return Interval(self.mean, self.mean - half_width, self.mean + half_width)
 
 
@@ -118,12 +117,16 @@ def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None =
     if clusters < MIN_INTERVAL_CLUSTERS:
         undefined = np.full(len(mean), np.nan)
         return Jackknife(mean, undefined, undefined, np.full((clusters, len(mean)), np.nan))
-    number = np.full(len(mean), float(clusters)) if weights is None else effective_number(weights)
+    effective_clusters = np.full(len(mean), float(clusters)) if weights is None else effective_number(weights)
     influence = _influences(statistic, total, sums.sum(axis=0))
-    variance, freedom = _variance(influence), np.where(number < MIN_INTERVAL_CLUSTERS, np.nan, number - 1)
+    variance, freedom = (
+        _variance(influence),
+        np.where(effective_clusters < MIN_INTERVAL_CLUSTERS, np.nan, effective_clusters - 1),
+    )
     if seeds > 1:
         seed_variance = _variance(_influences(statistic, total, sums.sum(axis=1)))
-        seed_variance = 2 * seed_variance if seeds == 2 else seed_variance  # else intervals cover less than 92 %
+        if seeds == 2:  # otherwise, intervals cover less than 92 %
+            seed_variance = 2 * seed_variance
         # it is part of both variances
         seed_variance = np.maximum(seed_variance - _variance_of_cells(statistic, total, sums), 0)
         total_variance = variance + seed_variance
@@ -170,7 +173,7 @@ def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
 
 
 def weighted_log_ratios(model: AnyFloats, baseline: AnyFloats) -> tuple[AnyFloats, AnyFloats]:
-    """Return `log_ratio` and its weight: 1, or both 0 if the baseline's error is 0.
+    """Return `log_ratio` and its weight, both (recording, value): 1, or both 0 if the baseline's error is 0.
 
     Both can be summed over recordings, to the logarithm of the geometric mean of their ratios.
     """

@@ -106,8 +106,10 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
     width = sums.shape[2] // 2
 
     def statistic(draws: AnyFloats) -> AnyFloats:
-        gain = measure.gain(*map(measure.error, (draws[:, :width], draws[:, width:])))
-        return (-np.log(np.maximum(1 - gain, intervals.MIN_RATIO)) if measure.name == "skill" else gain)[:, None]
+        gains = measure.gain(*map(measure.error, (draws[:, :width], draws[:, width:])))
+        if measure.name == "skill":
+            gains = -np.log(np.maximum(1 - gains, intervals.MIN_RATIO))
+        return gains[:, None]
 
     weights = measure.weight(sums.sum(axis=0)[:, width:])[:, None]
     effective = float(intervals.effective_number(weights)[0])
@@ -116,10 +118,11 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
 
 
 def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -> Gain:
-    """Return the gain of a predictor over the first of its baselines, from its `Pair` with each baseline.
+    """Return the gain of a predictor over the first of its baselines with its interval, from its `Pair` with each baseline.
 
     ``rivals`` are the pairs of other predictors from which this one may have been selected; they affect the lower bound
     of the interval. Further baselines affect the upper bound, because the first was selected as the best of them.
+    `NO_GAIN` without baselines.
     """
     if not pairs:
         return NO_GAIN
@@ -141,8 +144,10 @@ def _bound_distance(pairs: Sequence[Pair], freedom: float) -> float:
     common = set.intersection(*(set(pair.names) for pair in pairs))
     if len(common) < 2:  # The correlation is not defined, so Bonferroni's correction applies.
         return intervals.student_quantile(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs))
-    chosen = ([at for at, name in enumerate(pair.names) if name in common] for pair in distinct)
-    influences = [pair.jackknife.influence[at, 0] for pair, at in zip(distinct, chosen, strict=True)]
+    influences = []
+    for pair in distinct:
+        rows = [index for index, name in enumerate(pair.names) if name in common]
+        influences.append(pair.jackknife.influence[rows, 0])
     return intervals.largest_quantile(influences, freedom)
 
 
@@ -197,26 +202,30 @@ def rank(
     measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
 ) -> dict[str, Pair]:
     """Return the pairs of a model with each baseline that shares recordings with it, by name, lowest error first."""
-    pairs = {name: compared for name, sums in baselines.items() if (compared := pair(measure, model, sums, clusters))}
-    errors = {name: float(measure.error(compared.totals[1][None])[0]) for name, compared in pairs.items()}
+    pairs = {
+        name: compared_pair
+        for name, sums in baselines.items()
+        if (compared_pair := pair(measure, model, sums, clusters))
+    }
+    errors = {name: float(measure.error(compared_pair.totals[1][None])[0]) for name, compared_pair in pairs.items()}
     return {name: pairs[name] for name in sorted(pairs, key=lambda name: (np.isnan(errors[name]), errors[name]))}
 
 
 def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = None) -> Estimate:
-    """Return the score of one predictor, with its interval over clusters (and seeds if there are several)."""
-    rows, names = _paired_sums(sums, sums, clusters)
+    """Return the score of one predictor, with its interval over clusters (and seeds, if several); NaN without data."""
+    paired, names = _paired_sums(sums, sums, clusters)
     if not names:
         return Estimate(float("nan"), float("nan"), float("nan"))
-    rows = rows[:, :, : rows.shape[2] // 2]
-    relative = measure.name == "skill"  # skill compares errors by their ratio, points by their difference
+    rows = paired[:, :, : paired.shape[2] // 2]
+    is_relative = measure.name == "skill"  # skill compares errors by their ratio, points by their difference
 
     def statistic(draws: AnyFloats) -> AnyFloats:
         error = measure.error(draws)
-        return (np.log(np.maximum(error, intervals.MIN_RATIO)) if relative else error)[:, None]
+        return (np.log(np.maximum(error, intervals.MIN_RATIO)) if is_relative else error)[:, None]
 
     interval = intervals.jackknife(rows, statistic, measure.weight(rows.sum(axis=0))[:, None]).interval()
     ends = np.concatenate([interval.low, interval.high])
-    low, high = sorted(map(float, measure.score(np.exp(ends) if relative else ends)))
+    low, high = sorted(map(float, measure.score(np.exp(ends) if is_relative else ends)))
     return Estimate(measure.score_of(rows.sum(axis=0)), low, high)
 
 
@@ -264,23 +273,17 @@ def _paired_sums(model: Sums, reference: Sums, clusters: Mapping[str, str] | Non
     reference_sums: dict[str, list[AnyFloats]] = {}
     for (_, recording), errors in reference.items():
         reference_sums.setdefault(recording, []).append(errors)
-    rows = [
-        (
-            seed,
-            recording,
-            errors,
-            reference[seed, recording]
-            if (seed, recording) in reference
-            else np.mean(reference_sums[recording], axis=0),
-        )
-        for (seed, recording), errors in model.items()
-        if recording in reference_sums
-    ]
+    rows = []
+    for (seed, recording), errors in model.items():
+        if recording in reference_sums:
+            own = reference.get((seed, recording))
+            paired = np.mean(reference_sums[recording], axis=0) if own is None else own
+            rows.append((seed, recording, errors, paired))
     if not rows:
         return np.zeros((0, 0, 0)), []
     repeats = _repeat_index([(seed, recording) for seed, recording, *_ in rows])
     units = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
-    cluster_index = {name: at for at, name in enumerate(sorted(set(units)))}
+    cluster_index = {name: index for index, name in enumerate(sorted(set(units)))}
     sums = np.zeros((max(repeats.values()) + 1, len(cluster_index), 2 * len(rows[0][2])))
     cells = np.array([repeats[seed] for seed, *_ in rows]), np.array([cluster_index[name] for name in units])
     np.add.at(sums, cells, np.array([np.concatenate([first, second]) for _, _, first, second in rows]))
@@ -299,8 +302,11 @@ def _repeat_index(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
     for seeds in {frozenset(seeds) for seeds in by_recording.values()}:
         joined = [group for group in groups if group & seeds]
         groups = [group for group in groups if not group & seeds] + [set(seeds).union(*joined)]
-    order = {seed: at for at, seed in enumerate(dict.fromkeys(seed for seed, _ in keys))}
-    return {seed: at for group in groups for at, seed in enumerate(sorted(group, key=order.__getitem__))}
+    order = {seed: index for index, seed in enumerate(dict.fromkeys(seed for seed, _ in keys))}
+    repeats: dict[Hashable, int] = {}
+    for group in groups:
+        repeats |= {seed: index for index, seed in enumerate(sorted(group, key=order.__getitem__))}
+    return repeats
 
 
 def add_by_key(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:

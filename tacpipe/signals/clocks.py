@@ -81,11 +81,11 @@ class ClockFit:
 
 
 def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None) -> ClockFit:
-    """Fit a device's clock (time,) to the arrival times of its samples (time,), in row order.
+    """Return the fit of a device's clock (time,) to the arrival times of its samples (time,), in row order.
 
-    Only rows marked in ``certain`` (time,) are used, unless none is marked: others arrived while the host was delayed. A
-    segment that is too short to estimate its drift uses that of the longest segment, or 0. Raises `TacpipeError` if the
-    clock is constant or its rate differs from the host's by more than 10 %.
+    Only rows marked in ``certain`` (time,) are used, unless none is marked: others arrived while the host was delayed.
+    A segment that is too short to estimate its drift uses that of the longest segment, or 0. Raises `TacpipeError` if
+    the clock is constant or its rate differs from the host's by more than 10 %, or the numbers of times differ.
 
     >>> device_ns = np.arange(0, 10_000_000_000, 1_000_000)
     >>> fit = fit_clock(device_ns, 500 + device_ns + device_ns // 20_000)
@@ -109,14 +109,14 @@ def fit_clock(device_ns: Times, arrival_ns: Times, certain: Bools | None = None)
     spans = list(pairwise(edges))
     drifts = [_drift(device_ns[start:stop], arrival_ns[start:stop]) for start, stop in spans]
     fitted = [(stop - start, drift) for (start, stop), drift in zip(spans, drifts, strict=True) if drift is not None]
-    borrowed = max(fitted)[1] if fitted else 0.0
+    default_drift = max(fitted)[1] if fitted else 0.0
     segments = tuple(
-        _anchor(start, stop, device_ns, arrival_ns, borrowed if drift is None else drift)
+        _anchor(start, stop, device_ns, arrival_ns, default_drift if drift is None else drift)
         for (start, stop), drift in zip(spans, drifts, strict=True)
     )
-    late_ns = (arrival_ns - _map_times(segments, device_ns)).astype(np.float64)  # (time,)
-    quantiles = tuple(float(value) for value in np.quantile(late_ns, QUANTILES))
-    return ClockFit(segments, quantiles, float(np.median(np.abs(late_ns))))
+    residual_ns = (arrival_ns - _map_times(segments, device_ns)).astype(np.float64)  # (time,)
+    quantiles = tuple(float(value) for value in np.quantile(residual_ns, QUANTILES))
+    return ClockFit(segments, quantiles, float(np.median(np.abs(residual_ns))))
 
 
 def _to_all_rows(fit: ClockFit, rows: Int64s, count: int) -> ClockFit:
@@ -149,8 +149,8 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
     jumps = np.abs(np.diff(apart))
     if not len(jumps) or jumps.max() <= STEP_NS:
         return []
-    usual = float(np.median(_subsample(jumps)))  # median difference of latencies; steps are much larger
-    rows = np.flatnonzero(jumps > max(STEP_NS, 8 * usual)) + 1
+    median_jump = float(np.median(_subsample(jumps)))  # median difference of latencies; steps are much larger
+    rows = np.flatnonzero(jumps > max(STEP_NS, 8 * median_jump)) + 1
     rows = rows[np.argsort(-jumps[rows - 1], kind="stable")][:MAX_STEPS]
     period_ns = max(float(np.median(_subsample(np.diff(arrival_ns)))), 1.0)
     reach = int(np.clip(STEP_WINDOW_NS / period_ns, *STEP_WINDOW_ROWS))
@@ -159,8 +159,8 @@ def clock_steps(device_ns: Times, arrival_ns: Times) -> list[int]:
         first = max(max(step for step in steps if step <= row), row - reach)
         stop = min(min(step for step in steps if step >= row), row + reach)
         if first < row < stop:
-            moved = _low_quantile(apart[row:stop]) - _low_quantile(apart[first:row])
-            if abs(moved) > max(STEP_NS, jumps[row - 1] / 2):
+            shift_ns = _low_quantile(apart[row:stop]) - _low_quantile(apart[first:row])
+            if abs(shift_ns) > max(STEP_NS, jumps[row - 1] / 2):
                 steps.append(row)
     return sorted(steps[2:])
 
@@ -182,16 +182,21 @@ def _low_quantile(values: Floats) -> float:
 
 
 def _drift(device_ns: Times, arrival_ns: Times) -> float | None:
-    """Return the drift of a segment, or None if the segment is too short."""
+    """Return the drift of a segment, or None if the segment is too short.
+
+    Raises `TacpipeError` if it exceeds 10 %, or device times are constant.
+    """
     since_ns = (device_ns - device_ns[0]).astype(np.float64)  # (time,)
     span_ns = float(since_ns.max())
     if len(since_ns) < LINE_ROWS or max(span_ns, float(arrival_ns[-1] - arrival_ns[0])) < LINE_NS:
         return None
-    apart = arrival_ns - device_ns
-    apart_ns = (apart - apart[0]).astype(np.float64)
+    offset = arrival_ns - device_ns
+    apart_ns = (offset - offset[0]).astype(np.float64)
     rough = _rough_drift(_subsample(since_ns), _subsample(apart_ns))
     if rough is None or abs(rough) > MAX_DRIFT:
-        rate = "none" if rough is None else f"{1 / (1 + rough):.4g}" if rough > -1 else "negative"
+        rate = "none"
+        if rough is not None:
+            rate = f"{1 / (1 + rough):.4g}" if rough > -1 else "negative"
         raise TacpipeError(
             f"The rate of the device's clock is {rate} times the host's over {span_ns / 1e9:.4g} s; it must be within 10 % "
             "of it, with t_device_ns in nanoseconds. Correct the timestamps, or use arrival times (`--clock arrival`)."
@@ -310,7 +315,7 @@ def find_resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
 
 
 def times_by_offsets(segments: tuple[Segment, ...], starts: list[int], device_ns: Times) -> Times:
-    """Convert times of the clock (time,) to the other clock. ``starts`` are the first rows of the segments.
+    """Return times of the clock (time,) on the other clock. ``starts`` are the first rows of the segments.
 
     Rows before the first segment are converted with it.
     """

@@ -81,11 +81,11 @@ def measure_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> 
         return rest_level(values, t_ns[: len(values)], rest_s), None
     totals = [np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf) for values in blocks()]
     rows = lowest_rows(np.concatenate(totals), t_ns, rest_s)
-    chosen, first = [], 0
+    rest_values, first = [], 0
     for values in blocks():
-        chosen.append(values[rows[first : first + len(values)]])
+        rest_values.append(values[rows[first : first + len(values)]])
         first += len(values)
-    level: Floats = np.median(np.concatenate(chosen), axis=0).astype(np.float64)
+    level: Floats = np.median(np.concatenate(rest_values), axis=0).astype(np.float64)
     return level, rows
 
 
@@ -219,6 +219,7 @@ def contact_intervals(
 
 
 def _require_taxels(values: AnyArray, axes: int) -> None:
+    """Raise `TacpipeError` unless there are channels, a multiple of ``axes``."""
     channels = values.shape[1]
     if not channels or channels % axes:
         raise TacpipeError(

@@ -20,7 +20,7 @@ class Biquad:
     a: tuple[float, float]  # a1 and a2; a0 is 1
 
     def causal(self, values: AnyArray) -> Floats:
-        """Filter ``values`` (time,) forwards, as if the first value had been constant before.
+        """Return ``values`` (time,) filtered forwards, as if the first value had been constant before.
 
         The filter is in transposed direct form II.
         """
@@ -38,7 +38,7 @@ class Biquad:
         return np.array(filtered, dtype=np.float64)
 
     def both_ways(self, values: AnyArray) -> Floats:
-        """Filter ``values`` (time,) forwards and backwards, with zero phase and odd padding as in scipy.signal.filtfilt."""
+        """Return ``values`` (time,) filtered in both directions, with zero phase and odd padding as scipy.signal.filtfilt."""
         pad = min(PAD_ROWS, len(values) - 1)
         if pad < 1:
             return values.astype(np.float64)
@@ -86,6 +86,7 @@ def trailing_median(values: AnyArray, rows: int) -> Floats:
 
 
 def _medians(values: AnyArray, before: int, after: int) -> Floats:
+    """Return the median of the rows from ``before`` before to ``after`` after each row (time,), padded with end values."""
     if not len(values):
         return np.zeros(0)
     padded = np.pad(values.astype(np.float64), (before, after), mode="edge")

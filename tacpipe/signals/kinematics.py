@@ -19,7 +19,7 @@ UPRIGHT = 1e-12  # distance of a sine from 1 below which the angle counts as a r
 
 
 def make_continuous(quaternions: Floats) -> Floats:
-    """Normalise ``quaternions`` (time, 4) and choose each sign for the smaller distance to the previous one.
+    """Return ``quaternions`` (time, 4) normalised, with the sign of the smaller distance to the previous one.
 
     q and -q are the same rotation, and a recorded series may jump between them. The sign of the first is unchanged, and
     NaN is allowed.
@@ -35,7 +35,7 @@ def make_continuous(quaternions: Floats) -> Floats:
 
 
 def matrices_to_quaternions(matrices: Floats) -> Floats:
-    """Convert rotation matrices (time, 3, 3) to unit quaternions (time, 4) with non-negative w.
+    """Return unit quaternions (time, 4) with non-negative w of rotation matrices (time, 3, 3).
 
     The largest pivot is used, so that no division is by a small number (Shepperd, "Quaternion from rotation matrix",
     1978).
@@ -62,7 +62,7 @@ def matrices_to_quaternions(matrices: Floats) -> Floats:
 
 
 def quaternions_to_matrices(quaternions: Floats) -> Floats:
-    """Convert unit quaternions (time, 4) to rotation matrices (time, 3, 3)."""
+    """Return the rotation matrices (time, 3, 3) of unit quaternions (time, 4)."""
     x, y, z, w = quaternions.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -80,7 +80,7 @@ def vectors_to_quaternions(vectors_rad: Floats) -> Floats:
 
 
 def quaternions_to_vectors(quaternions: Floats) -> Floats:
-    """Convert unit quaternions (time, 4) to rotation vectors (time, 3) with angles of at most pi."""
+    """Return the rotation vectors (time, 3), with angles of at most pi, of unit quaternions (time, 4)."""
     signed = np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
     sine = np.linalg.norm(signed[:, :3], axis=1, keepdims=True)
     half = np.arctan2(sine, signed[:, 3:])
@@ -89,7 +89,7 @@ def quaternions_to_vectors(quaternions: Floats) -> Floats:
 
 
 def angles_to_quaternions(angles_rad: Floats) -> Floats:
-    """Convert intrinsic z-y-x Euler angles (time, 3) in rad, KUKA's A, B and C, to unit quaternions (time, 4)."""
+    """Return the unit quaternions (time, 4) of intrinsic z-y-x Euler angles (time, 3) in rad, KUKA's A, B and C."""
     (cz, cy, cx), (sz, sy, sx) = np.cos(angles_rad.T / 2), np.sin(angles_rad.T / 2)
     return np.column_stack(
         [
@@ -102,7 +102,7 @@ def angles_to_quaternions(angles_rad: Floats) -> Floats:
 
 
 def quaternions_to_angles(quaternions: Floats) -> Floats:
-    """Convert unit quaternions (time, 4) to intrinsic z-y-x Euler angles (time, 3) in rad.
+    """Return the intrinsic z-y-x Euler angles (time, 3) in rad of unit quaternions (time, 4).
 
     In gimbal lock, the last angle is 0.
     """
@@ -177,10 +177,9 @@ def carries_hand(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats)
     If not, the hand belongs to another arm. Non-finite rows are ignored.
     """
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
-    joint_rad, hand_m = joint_rad[finite], hand_m[finite]
-    last = last_frames(chain, joint_rad)
+    last = last_frames(chain, joint_rad[finite])
     # (time, 3), in the frame of the last link
-    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])
+    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m[finite] - last[:, :3, 3])
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 

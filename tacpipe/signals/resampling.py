@@ -46,9 +46,9 @@ def uniform_offsets(first: int, count: int, rate_hz: float) -> Times:
 
 
 def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
-    """Interpolate ``values`` (time, channel) linearly at ``grid_ns``, as float64 (grid, channel).
+    """Return ``values`` (time, channel) interpolated linearly at ``grid_ns``, as float64 (grid, channel).
 
-    A NaN affects only the points between it and its neighbours.
+    A NaN affects only the points between it and its neighbours. Raises `TacpipeError` without samples.
     """
     lower, upper, weight = _neighbours(t_ns, grid_ns)
     start: Floats = np.take(values, lower, axis=0).astype(np.float64, copy=False)  # (grid, channel)
@@ -59,19 +59,19 @@ def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
 
 
 def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
-    """Interpolate ``quaternions`` (time, 4) at ``grid_ns`` (grid, 4) with constant angular speed along the shorter arc.
+    """Return ``quaternions`` (time, 4) at ``grid_ns`` (grid, 4), with constant angular speed along the shorter arc.
 
-    Quaternions are x, y, z, w. They are normalised with `kinematics.make_continuous` first, so that scale and sign do not
-    matter.
+    Quaternions are x, y, z, w. They are normalised with `kinematics.make_continuous` first, so that scale and sign do
+    not matter. Raises `TacpipeError` without samples.
     """
     ends = make_continuous(quaternions)
     lower, upper, weight = _neighbours(t_ns, grid_ns)
     start, stop = ends[lower], ends[upper]  # (grid, 4)
     angle = np.arccos(np.clip((start * stop).sum(axis=1), -1.0, 1.0))  # (grid,)
-    near = ~(angle > PARALLEL)
-    sine = np.where(near, 1.0, np.sin(angle))
-    first = np.where(near, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
-    second = np.where(near, weight, np.sin(weight * angle) / sine)
+    is_small = ~(angle > PARALLEL)
+    sine = np.where(is_small, 1.0, np.sin(angle))
+    first = np.where(is_small, 1.0 - weight, np.sin((1.0 - weight) * angle) / sine)
+    second = np.where(is_small, weight, np.sin(weight * angle) / sine)
     interpolated: Floats = first[:, None] * start + second[:, None] * stop
     interpolated /= np.linalg.norm(interpolated, axis=1, keepdims=True)
     return interpolated
@@ -80,7 +80,8 @@ def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
 def median_around(t_ns: Times, values: AnyArray, grid_ns: Times, half_ns: int) -> Floats:
     """Return the median of the samples within ``half_ns`` of each grid point, float64 (grid, channel).
 
-    ``values`` are (time, channel). Without a sample in the window, the result is that of `linear`.
+    ``values`` are (time, channel). Without a sample in the window, the result is that of `linear`. Raises
+    `TacpipeError` without samples.
     """
     medians = linear(t_ns, values, grid_ns)
     first = np.searchsorted(t_ns, grid_ns - half_ns, side="left")
@@ -104,7 +105,10 @@ def bracketing_rows(t_ns: Times, grid_ns: Times) -> Indices:
 
 
 def nearest_rows(t_ns: Times, grid_ns: Times) -> Indices:
-    """Return the row of the nearest sample for each grid point (grid,), of two equally near ones the earlier."""
+    """Return the row of the nearest sample for each grid point (grid,), of two equally near ones the earlier.
+
+    Raises `TacpipeError` without samples.
+    """
     _require_samples(t_ns)
     after = np.clip(np.searchsorted(t_ns, grid_ns, side="right"), 1, max(len(t_ns) - 1, 1))
     before = after - 1
@@ -163,14 +167,15 @@ def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     """Return a mask of grid points (grid,) between samples more than ``gap_ns`` apart, or outside the samples' range."""
     lower, upper, _ = _neighbours(t_ns, grid_ns)
     outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
-    inside: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
-    return inside
+    is_in_gap: Bools = outside | (t_ns[upper] - t_ns[lower] > gap_ns)
+    return is_in_gap
 
 
 def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
     """Return the rows before and after each grid point and the weight of the latter, each (grid,).
 
-    At a sample, both rows are that sample, so that the next sample has no effect.
+    At a sample, both rows are that sample, so that the next sample has no effect. Raises `TacpipeError` without
+    samples.
     """
     _require_samples(t_ns)
     last = len(t_ns) - 1

@@ -72,14 +72,16 @@ def sliding_rows(speed_m_s: Floats, first: int, least_m_s: float, steady_rows: i
     (3, 8)
     """
     moving = np.flatnonzero(in_long_runs(speed_m_s[first:] >= least_m_s, steady_rows))
-    return (first + int(moving[0]), first + int(moving[-1]) + 1) if len(moving) else None
+    if not len(moving):
+        return None
+    return first + int(moving[0]), first + int(moving[-1]) + 1
 
 
 def crop_rows(slide: Rows, frames: int, crop: str, offset_first: int) -> Rows:
-    """Crop a slide to ``frames`` rows (crop ``middle`` or ``offset``), or return all its rows (``none``).
+    """Return the rows of a slide cropped to ``frames`` rows (crop ``middle`` or ``offset``), or all (``none``).
 
-    With ``middle``, if the rows cannot be centred, one row fewer is removed before than after them. With ``offset``, they
-    start at row ``offset_first``. Raises `TacpipeError` for another crop, or if there are too few rows.
+    With ``middle``, if the rows cannot be centred, one row fewer is removed before than after them. With ``offset``,
+    they start at row ``offset_first``. Raises `TacpipeError` for another crop, or if there are too few rows.
 
     >>> crop_rows((0, 800), 400, "middle", 0), crop_rows((0, 799), 400, "middle", 0), crop_rows((3, 800), 400, "offset", 101)
     ((200, 600), (199, 599), (101, 501))
