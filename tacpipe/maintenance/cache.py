@@ -55,7 +55,7 @@ def status(store: CachedStore) -> BucketStatus:
     """Return the status of the bucket, as `repair.status` does, and the path and sizes of its local cache."""
     bucket = store.bucket
     all_roots = bucket.roots.all()
-    folder = repair.status(store)
+    cache_status = repair.status(store)
     return {
         "store": store.place,
         "there": bucket.check(),
@@ -66,9 +66,9 @@ def status(store: CachedStore) -> BucketStatus:
         "running": [run.note for _, run in bucket.runs().values()],
         "cache": {
             "path": str(store.root),
-            "objects": folder["objects"],
-            "records": folder["records"],
-            "checkpoints": folder["checkpoints"],
+            "objects": cache_status["objects"],
+            "records": cache_status["records"],
+            "checkpoints": cache_status["checkpoints"],
         },
     }
 
@@ -147,6 +147,7 @@ def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: 
 
 
 def _expired_roots(store: CachedStore, grace_days: float) -> list[Root]:
+    """Return the roots of datasets whose directories have been missing for the whole grace period."""
     expired = []
     for root in store.roots.all():
         content, reached = garbage.content(Path(root["path"]))
@@ -183,7 +184,7 @@ def clear(store: CachedStore, *, dry_run: bool) -> Collected:
 
 
 def status_text(value: BucketStatus) -> str:
-    """Return the status as text."""
+    """Return the status as text, one line per folder, root and active run."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [_line("objects", value["objects"]), _line("records", value["records"]), _line("tmp", value["tmp"])]
     lines += [f"  root  {root['manifest'][:12]}  {root['path']}" for root in value["roots"]]

@@ -47,7 +47,7 @@ class Known:
 
 
 def list_manifests(store: AnyStore) -> list[Known]:
-    """Return the present and past manifests of the store's roots, newest first."""
+    """Return the present and past manifests of the store's roots, newest first; those that were collected are omitted."""
     by_label: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
     for root in roots:
@@ -76,7 +76,7 @@ def list_manifests(store: AnyStore) -> list[Known]:
 
 
 def _state(root: Root, name: str) -> str:
-    """Return what happened to the last manifest written at the path of ``root``."""
+    """Return what happened to the manifest ``name``, the last one written at the path of ``root``, as a constant."""
     if root["kind"] == PUSHED:
         return IN_STORE
     path = Path(root["path"])
@@ -119,18 +119,20 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     without ``replace``; `DamagedError` if part of it is damaged and cannot be recomputed.
     """
     store = locate()
+    other_store = source
     if source is None and store.distant:
-        source = cache.bucket_or_folder(store)
-    manifest_digest = _manifest_digest(source or store, name)
+        other_store = cache.bucket_or_folder(store)
+    read_store = other_store or store
+    manifest_digest = _manifest_digest(read_store, name)
     with store.at_work([manifest_digest]):
-        content = (source or store).read(manifest_digest, regular.JSON_BYTES)
-        manifest = manifest_of.parse(content, manifest_digest, StoredPages(source or store), verified=source is None)
+        content = read_store.read(manifest_digest, regular.JSON_BYTES)
+        manifest = manifest_of.parse(content, manifest_digest, StoredPages(read_store), verified=other_store is None)
         directory_of.check_output(store, output)
         if not replace:
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
         read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
-        if source is not None:
-            transfer.bring(source, store, manifest_of.Found(output, content, source), copying.Transferred())
+        if other_store is not None:
+            transfer.bring(other_store, store, manifest_of.Found(output, content, other_store), copying.Transferred())
         for first in (True, False):
             try:
                 directory_of.publish(store, manifest, output, replace=replace)
@@ -149,7 +151,10 @@ def _is_manifest(store: AnyStore, name: str) -> bool:
 
 
 def _manifest_digest(store: AnyStore, name: str) -> str:
-    """Return the digest of the manifest with this digest, or last written at this path."""
+    """Return the digest of the manifest with this digest or prefix, last written at this path, or pushed under this name.
+
+    Raises `UsageError` if there is none, or several begin with ``name``.
+    """
     root = store.roots.get(Path(name).absolute())
     if root is not None:
         return str(root["manifest"])

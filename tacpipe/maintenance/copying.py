@@ -46,7 +46,10 @@ class _Plan:
 
 
 def _plan_copy(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *, ancestors: bool) -> _Plan:
-    """Return what a dataset needs: its manifest and objects, its ancestors' manifests, and optionally their objects."""
+    """Return what a dataset needs: its manifest and objects, its ancestors' manifests, and optionally their objects.
+
+    Raises `DamagedError` if a page of a manifest is invalid.
+    """
     plan = _Plan()
     todo, visited = [dataset.digest], set()
     while todo:
@@ -95,19 +98,21 @@ def copy(
     sizes = plan.sizes()
     target.announce(sizes)  # announced before the sizes are read, so that no collection removes an object in between
     present_sizes = target.sizes(sizes)
-    absent = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
-    _expect_room(target, sum(sizes[name] for name in absent))
-    absent += _find_damaged(
+    absent_objects = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
+    _expect_room(target, sum(sizes[name] for name in absent_objects))
+    absent_objects += _find_damaged(
         target, [name for name in plan.objects if present_sizes.get(name) == sizes[name]], sizes, verify=verify
     )
-    _send(source, target, plan, absent, dataset_dirs)
-    target.settle(layout.object_name(name) for name in absent)
-    fresh = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
-    fresh += _find_damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
-    for name in fresh:
+    _send(source, target, plan, absent_objects, dataset_dirs)
+    target.settle(layout.object_name(name) for name in absent_objects)
+    absent_manifests = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
+    absent_manifests += _find_damaged(
+        target, [name for name in plan.manifests if name not in absent_manifests], sizes, verify=verify
+    )
+    for name in absent_manifests:
         target.take(name, [plan.manifests[name]])
-    target.settle(layout.object_name(name) for name in fresh)
-    moved = {*absent, *fresh}
+    target.settle(layout.object_name(name) for name in absent_manifests)
+    moved = {*absent_objects, *absent_manifests}
     transferred.objects += len(moved)
     transferred.bytes += sum(sizes[name] for name in moved)
     transferred.there += len(sizes) - len(moved)
@@ -126,12 +131,9 @@ def _find_damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, in
             return False
         return True
 
-    names = list(names) if verify else []
-    return [
-        name
-        for name, sound in zip(names, threads.map_in_threads(is_sound, names, target.at_once), strict=True)
-        if not sound
-    ]
+    checked = list(names) if verify else []
+    soundness = threads.map_in_threads(is_sound, checked, target.at_once)
+    return [name for name, sound in zip(checked, soundness, strict=True) if not sound]
 
 
 def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], directories: tuple[str, ...]) -> None:
@@ -164,7 +166,10 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
 def _copy_records(
     source: AnyStore, target: AnyStore, dataset: manifest_of.Found, moved: Collection[str], before: str
 ) -> None:
-    """Copy the records of a dataset, and note in ``target`` which they are."""
+    """Copy the records of a dataset whose objects were all ``moved``, and note in ``target`` which they are.
+
+    Records that are noted for it, or for the manifest ``before``, are not copied again.
+    """
     noted_keys = target.noted(dataset.digest) | (target.noted(before) if before else set())
 
     def commit(keyed_record: tuple[str, Record]) -> str:
@@ -214,13 +219,13 @@ def _check_size(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes
         )
 
 
-def _expect_room(target: AnyStore, needed: int) -> None:
+def _expect_room(target: AnyStore, needed_bytes: int) -> None:
     """Raise `StorageError` if the disk of a store has less free space than needed."""
-    room = target.room()
-    if room is not None and needed > room:
+    free_bytes = target.room()
+    if free_bytes is not None and needed_bytes > free_bytes:
         raise StorageError(
-            f"{needed / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has {room / 1e9:,.1f} GB left; "
-            f"nothing was copied. If that is what you expect, free some space; if it came from an untrusted store, do not."
+            f"{needed_bytes / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has {free_bytes / 1e9:,.1f} GB "
+            f"left; nothing was copied. If that is what you expect, free some space; if it came from an untrusted store, do not."
         )
 
 
@@ -228,8 +233,8 @@ def _named_digests(record: Record) -> set[str]:
     """Return the digests in a record; an empty set if it is malformed, because a store may contain anything."""
     identity, provenance = record["identity"], record["provenance"]
     try:
-        formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)
-        digests = set(records.digests(record["result"])) if formed else set()
+        is_well_formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)
+        digests = set(records.digests(record["result"])) if is_well_formed else set()
     except (TypeError, KeyError, AttributeError):
         return set()
     return digests if all(isinstance(name, str) for name in digests) else set()

@@ -62,7 +62,8 @@ class LiveObjects:
 def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
     """Return the needed content; with ``lasting``, also replaced content that cannot be recomputed.
 
-    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because its content is then unknown.
+    Marks roots whose paths are missing, unless ``dry_run``. Raises `DamagedError` if a root or the manifest of an
+    ancestor is damaged, because its content is then unknown.
     """
     needed, pending, replaced = LiveObjects(), [], []
     for run in store.leases.runs():  # runs are read before roots: a run that ends in between has written its root
@@ -131,6 +132,7 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
+    """Collect garbage as `collect` does, within its lock. Raises `DamagedError` as `live` does."""
     # records are read before `live`, because damaged ones go to quarantine, which `live` reads
     records = _summaries(store)
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
@@ -213,6 +215,7 @@ def _young(path: str) -> bool:
 
 
 def _remove_record(path: str, *, dry_run: bool) -> bool:
+    """Remove a record that is not young, unless ``dry_run``; return whether there was such a record."""
     if _young(path):
         return False
     if not dry_run:

@@ -40,14 +40,14 @@ def labels(all_roots: Iterable[Root]) -> dict[tuple[str, str], str]:
     >>> list(labels([{"path": "rec", "project": one}, {"path": "rec", "project": two}]).values())
     ['aaaaaaaa:rec', 'bbbbbbbb:rec']
     """
-    all_roots = list(all_roots)
-    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in all_roots}
+    pushed_roots = list(all_roots)
+    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in pushed_roots}
     shared = Counter(ids.values())
     names = {
         identifier: identifier[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name
         for identifier, name in ids.items()
     }
-    return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in all_roots}
+    return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in pushed_roots}
 
 
 def label(root: Root, all_roots: Iterable[Root]) -> str:
@@ -126,7 +126,10 @@ def _roots_of_name(name: str, pushed_roots: Iterable[Root], project: Project | N
 
 
 def refuse_newer(store: AnyStore, before: Root, seen_manifests: Collection[str | None], name: str) -> None:
-    """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen_manifests``."""
+    """Raise `UsageError` if the manifest of ``before`` is none of those that the pushing project has ``seen_manifests``.
+
+    ``name`` is the name of the pushed dataset.
+    """
     manifest = str(before["manifest"])
     if manifest in seen_manifests:
         return
@@ -158,12 +161,10 @@ def forget(store: AnyStore, requested: str, *, dry_run: bool = False) -> bool:
         if not dry_run:
             store.roots.remove(matching[0])
         return True
-    snapshots = {
-        digest
-        for root in all_roots
-        for digest in manifests(root)
-        if len(requested) >= MIN_DIGITS and digest.startswith(requested)
-    }
+    snapshots: set[str] = set()
+    if len(requested) >= MIN_DIGITS:
+        for root in all_roots:
+            snapshots |= {digest for digest in manifests(root) if digest.startswith(requested)}
     if len(snapshots) > 1:
         raise UsageError(
             f"{len(snapshots)} snapshots in {store.place} begin with {requested}; give more of its hex digits."

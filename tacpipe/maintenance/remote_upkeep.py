@@ -224,7 +224,8 @@ def _forget_dead(store: RemoteStore, grace_days: float) -> float:
 def _collect_needed(store: RemoteStore) -> _Needed:
     """Return what announcements and roots need.
 
-    Announcements are read first: a run that ends in between has already written its root.
+    Announcements are read first: a run that ends in between has already written its root. Raises `DamagedError` if a
+    root or a needed manifest is damaged.
     """
     needed = _Needed()
     pending: list[str] = []

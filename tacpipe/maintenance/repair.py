@@ -290,7 +290,7 @@ def _reachable(root: Root) -> bool:
 
 
 def status_text(value: FolderStatus) -> str:
-    """Return the status as text."""
+    """Return the status as text, one line per folder, root and active run."""
     lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
     lines += [
         f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _MEASURED
@@ -309,6 +309,7 @@ def _find(root: Root) -> manifest_of.Found | None:
 
 
 def _sound(directory: Path) -> manifest_of.Found | None:
+    """Return the dataset in a directory, or None if there is none or its manifest is damaged."""
     try:
         dataset = manifest_of.find(directory)
         dataset.manifest  # noqa: B018  (is it sound?)

@@ -46,10 +46,10 @@ class SoundRecords:
 
     def read(self, key: str) -> RecordSummary:
         """Return the summary of a record. Raises what `Store.read_record` raises, which moves a damaged one aside."""
-        path, name = self._store.record_path(key), key.encode()
-        line = self._remembered.get(name)
+        path, key_bytes = self._store.record_path(key), key.encode()
+        line = self._remembered.get(key_bytes)
         if line is not None and line[:64] == regular.small_file_digest(path).encode():
-            self._lines[name] = line
+            self._lines[key_bytes] = line
             return RecordSummary(line[65:].decode(), line[64:65] == b"!")
         with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError, OSError, TacpipeError):
             content = regular.content(path, regular.JSON_BYTES, follow=False)
@@ -58,7 +58,7 @@ class SoundRecords:
             if record is not None:
                 summary = _summary(record)
                 mark = b"!" if summary.irreplaceable else b" "
-                self._lines[name] = content_digest + mark + summary.names.encode()
+                self._lines[key_bytes] = content_digest + mark + summary.names.encode()
                 return summary
         return _summary(self._store.read_record(key))
 
@@ -83,8 +83,8 @@ class SoundPages:
 
     def names(self, pages: Pages, number: int) -> set[str]:
         """Return the digests of the shards that a page names. Raises the errors of `Pages.load`."""
-        page, following = pages.pages[number], pages.pages[number + 1 : number + 2]
-        statement = digest([page.to_json(), *(later.first for later in following)]).encode()
+        page, next_pages = pages.pages[number], pages.pages[number + 1 : number + 2]
+        statement = digest([page.to_json(), *(later.first for later in next_pages)]).encode()
         if statement in self._remembered:
             names = {name.decode() for name in _SHARD_DIGEST.findall(pages.object(page))}
         else:

@@ -155,7 +155,8 @@ def bring(
 def _announce_read(store: Store, manifest: str) -> Iterator[bool]:
     """Block `gc` in a store that is being read. Yields False if the store is read-only; a push does not need it.
 
-    A concurrent collection is then not blocked: if it removes something before it is copied, the push fails.
+    A concurrent collection is then not blocked: if it removes something before it is copied, the push fails with a
+    `DamagedError` that explains it.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -188,11 +189,12 @@ def _publish_name(
 ) -> None:
     """Make ``name`` refer to the copied dataset. Raises the errors of `push` if another push came first."""
     project: RootProject = {"id": owner.id, "name": owner.name}
+    previous = before
     for _ in range(_LOOKS):
-        lasting = before is not None and pushed.lasting(target, before["manifest"])
-        if target.roots.push(name, project, dataset.digest, before, lasting=lasting):
+        lasting = previous is not None and pushed.lasting(target, previous["manifest"])
+        if target.roots.push(name, project, dataset.digest, previous, lasting=lasting):
             break
-        before = _predecessor(target, local_store, dataset, owner, name, replace=replace)
+        previous = _predecessor(target, local_store, dataset, owner, name, replace=replace)
     else:
         raise TacpipeError(
             f"{name} is pushed to {target.place} by other commands again and again. Run the same command again later."
@@ -230,7 +232,10 @@ def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> 
 
 
 def _find_dataset(path: Path, source: AnyStore) -> tuple[manifest_of.Found, str]:
-    """Return the manifest at a path, or else the one pushed from there or by the named project, and its name."""
+    """Return the manifest at a path, or else the one pushed from there or by the named project, and its name.
+
+    Raises `UsageError` if there is none, several match, or the pushed path is not safe.
+    """
     directory = path.parent if path.name == manifest_of.NAME else path
     if (directory / manifest_of.NAME).exists():
         return manifest_of.Found(directory, manifest_of.find(directory).content, source), str(directory)

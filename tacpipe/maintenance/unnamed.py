@@ -58,14 +58,14 @@ def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterabl
         except TacpipeError:
             continue
         try:
-            unlike = {
+            new_possessions = {
                 (*possession, value)
                 for possession, value in replacing.possessions(manifest)
                 if possession not in covered
             }
-            if unlike:
+            if new_possessions:
                 object_digests = {digest for _, digest in manifest.objects()}
-                candidates[is_page].append(_Candidate(name, unlike, object_digests))
+                candidates[is_page].append(_Candidate(name, new_possessions, object_digests))
         except MissingPageError:  # it may have contained anything
             names[name] = manifest.reached({}, lenient=True)
     retained: set[tuple[object, ...]] = set()

@@ -38,7 +38,7 @@ class Biquad:
         return np.array(filtered, dtype=np.float64)
 
     def both_ways(self, values: AnyArray) -> Floats:
-        """Return ``values`` (time,) filtered in both directions, with zero phase and odd padding as scipy.signal.filtfilt."""
+        """Return ``values`` (time,) filtered in both directions, with zero phase, padded as scipy.signal.filtfilt."""
         pad = min(PAD_ROWS, len(values) - 1)
         if pad < 1:
             return values.astype(np.float64)

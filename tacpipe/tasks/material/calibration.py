@@ -94,7 +94,7 @@ def _select_learned(classifier: Classifier, slides: Slides, held_out: set[int]) 
 
 
 def _check_slides(classifier: Classifier, training: BySensor, validation: BySensor) -> None:
-    """Raise `TacpipeError` for sensors without slides, and for validation slides that the model was trained on."""
+    """Raise `TacpipeError` for a sensor without slides, and `UsageError` for slides that the model was trained on."""
     for part, role in ((training, "train"), (validation, "val")):
         missing = sorted(set(classifier.layouts) - set(part))
         if missing:
@@ -103,9 +103,8 @@ def _check_slides(classifier: Classifier, training: BySensor, validation: BySens
                 f"own. Give a split that has some."
             )
     seen_digests = set(classifier.config["trained_on"].values())
-    if getattr(classifier.params, "use_validation", False) and any(
-        digest in seen_digests for slides in validation.values() for digest in slides.digests
-    ):
+    has_seen = any(not seen_digests.isdisjoint(slides.digests) for slides in validation.values())
+    if getattr(classifier.params, "use_validation", False) and has_seen:
         raise UsageError(
             "The model was trained on these validation slides, so its errors on them are too small. Train it with "
             "--no-use-validation."
@@ -135,10 +134,14 @@ class Answers:
         if not classifier.calibrations:
             return is_known
         scores = classifier.readers[sensor].read(slides.frames).scores
-        self._measure(sensor, slides, scores, is_known, ~in_training)
+        self._add_measures(sensor, slides, scores, is_known, ~in_training)
         return is_known
 
-    def _measure(self, sensor: str, slides: Slides, scores: Float32s, is_known: Bools, fresh: Bools) -> None:
+    def _add_measures(self, sensor: str, slides: Slides, scores: Float32s, is_known: Bools, fresh: Bools) -> None:
+        """Add the measures and the rows of a sensor's slides, from their scores (slide, class) and two masks (slide,).
+
+        Only ``fresh`` slides, which were not used for training or validation, are measured.
+        """
         sensor_calibration = self.classifier.calibrations[sensor]
         held_out = self.classifier.config.get("held_out", {}).get(sensor, [])
         learned = is_known & fresh & ~np.isin(slides.materials, held_out)
@@ -174,21 +177,11 @@ class Answers:
             self.unknown[sensor] = measures
         names = self.classifier.naming.names_for(self.classifier.best_classes(scores))
         best = sensor_calibration.probabilities(scores).max(axis=1)
-        for at, name in enumerate(slides.names):
-            answer = UNKNOWN_ANSWER if score[at] < sensor_calibration.threshold else str(names[at])
-            flags = [str(bool(flag)).lower() for flag in (is_known[at], not fresh[at])]
-            self.rows.append(
-                (
-                    name,
-                    sensor,
-                    *flags,
-                    names[at],
-                    f"{best[at]:.6g}",
-                    f"{score[at]:.6g}",
-                    answer,
-                    self.labels.get(name, ""),
-                )
-            )
+        for index, name in enumerate(slides.names):
+            answer = UNKNOWN_ANSWER if score[index] < sensor_calibration.threshold else str(names[index])
+            flags = [str(bool(flag)).lower() for flag in (is_known[index], not fresh[index])]
+            numbers = [f"{best[index]:.6g}", f"{score[index]:.6g}"]
+            self.rows.append((name, sensor, *flags, names[index], *numbers, answer, self.labels.get(name, "")))
 
     def metrics(self) -> MaterialMetrics:
         """Return the entries of ``metrics.json``."""
@@ -200,7 +193,10 @@ class Answers:
         return metrics
 
     def files(self) -> dict[str, bytes]:
-        """Return ``answers.csv`` with one row per slide: best class, its probability, score of known, answer, label."""
+        """Return ``answers.csv`` with one row per slide: best class, its probability, score of known, answer, label.
+
+        Empty for an uncalibrated model.
+        """
         if not self.classifier.calibrations:
             return {}
         text = io.StringIO()

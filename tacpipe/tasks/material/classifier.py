@@ -173,6 +173,10 @@ class Classifier:
     """Readers of one or more sensors that predict a slide's material; `model` adds the functions that read recordings."""
 
     def __init__(self, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> None:
+        """Build a classifier from a model's files; ``chain`` contains its preprocessing stages, None if they are unknown.
+
+        Raises `TacpipeError` if a file is missing or invalid.
+        """
         self.chain = chain  # preprocessing stages of the model; None if unknown
         config: MaterialConfig = model_files.tree(files, CONFIG, NEEDED)
         self.config = config
@@ -218,7 +222,7 @@ class Classifier:
         return classifier
 
     def _check_parts(self) -> None:
-        """Read a slide of noise of each sensor, so that incompatible parts raise an error."""
+        """Read a slide of noise of each sensor, so that incompatible parts raise an error (mostly ``ValueError``)."""
         if not self.layouts or not self.classes or len({*self.classes}) != len(self.classes):
             raise ValueError(f"there are {len(self.layouts)} sensors and {len(self.classes)} classes")
         if self.naming.names and not set(self.classes) <= set(range(len(self.naming.names))):
@@ -278,14 +282,15 @@ class Classifier:
     def is_unknown(self, scores: Float32s, frames: Float32s, sensor: str) -> Bools:
         """Return a mask (slide,) of slides below the sensor's threshold of known classes; all False if uncalibrated."""
         sensor_calibration = self.calibrations.get(sensor)
-        return (
-            np.zeros(len(scores), dtype=bool)
-            if sensor_calibration is None
-            else sensor_calibration.score(scores, frames) < sensor_calibration.threshold
-        )
+        if sensor_calibration is None:
+            return np.zeros(len(scores), dtype=bool)
+        return sensor_calibration.score(scores, frames) < sensor_calibration.threshold
 
     def _resolve_sensor(self, sensor: str) -> str:
-        """Return the sensor of slides: ``sensor`` or, if that is empty, the only one."""
+        """Return the sensor of slides: ``sensor`` or, if that is empty, the only one.
+
+        Raises `UsageError` if there are several.
+        """
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
                 f"The model knows the sensors {', '.join(self.layouts)}; name the one that recorded the slides."
@@ -322,7 +327,8 @@ class Classifier:
         """Return the slides of a dataset by sensor, with the channels of this model.
 
         Slides of other sensors are skipped if the model was trained for named sensors; otherwise they raise an error.
-        ``advance`` is called after each slide. Raises `TacpipeError` as `tacpipe.tasks.material.slides.read`.
+        ``labelled`` requires a label of each slide. ``advance`` is called after each slide. Raises `TacpipeError` as
+        `tacpipe.tasks.material.slides.read`.
         """
         only = tuple(self.layouts) if self.params.sensors else ()
         present_sensors = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}

@@ -78,6 +78,10 @@ class FittedEstimator:
         return values.astype(np.float32)
 
     def _features(self, frames: Float32s) -> Float32s:
+        """Return the features of slides (slide, feature).
+
+        Raises `TacpipeError` for another shape, or values that are not finite.
+        """
         features: Float32s = np.asarray(self.features(frames), np.float32)
         if features.ndim != 2 or len(features) != len(frames) or not np.isfinite(features).all():
             state = (
@@ -166,32 +170,34 @@ def _make_reproducible(content: bytes) -> bytes:
     numbers: dict[Any, int] = {}
     description = _renumber(json.loads(members[SCHEMA]), numbers)
     renamed = {SCHEMA: json.dumps(description, indent=1, sort_keys=True).encode()}
-    renamed |= {
-        _renumber_file_name(member, numbers): content for member, content in members.items() if member != SCHEMA
-    }
+    renamed |= {_renumber_file_name(member, numbers): data for member, data in members.items() if member != SCHEMA}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
-        for member, content in sorted(renamed.items()):
+        for member, data in sorted(renamed.items()):
             info = zipfile.ZipInfo(member, MODIFICATION_TIME)
             info.compress_type = zipfile.ZIP_DEFLATED
-            file.writestr(info, content)
+            file.writestr(info, data)
     return buffer.getvalue()
 
 
 def _renumber(node: Any, numbers: dict[Any, int]) -> Any:
-    """Return a description with ``__id__`` numbered from 1 in order of occurrence, and the file names to match."""
+    """Return a description with ``__id__`` numbered from 1 in order of occurrence, and the file names to match.
+
+    ``numbers`` maps the earlier ids to the numbers, and is extended.
+    """
     if isinstance(node, list):
         return [_renumber(child, numbers) for child in node]
     if not isinstance(node, Mapping):
         return node
-    return {
-        name: numbers.setdefault(value, len(numbers) + 1)
-        if name == "__id__"
-        else _renumber_file_name(value, numbers)
-        if name == "file"
-        else _renumber(value, numbers)
-        for name, value in node.items()
-    }
+    renumbered: dict[str, Any] = {}
+    for name, value in node.items():
+        if name == "__id__":
+            renumbered[name] = numbers.setdefault(value, len(numbers) + 1)
+        elif name == "file":
+            renumbered[name] = _renumber_file_name(value, numbers)
+        else:
+            renumbered[name] = _renumber(value, numbers)
+    return renumbered
 
 
 def _renumber_file_name(name: str, numbers: dict[Any, int]) -> str:

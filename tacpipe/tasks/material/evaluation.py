@@ -62,7 +62,10 @@ def chance(counts: Mapping[str, int], classes: int) -> ChanceAccuracy:
 
 
 def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> MaterialScores:
-    """Return the scores of predictors; ``right`` contains masks of correct slides (slide,) by predictor and sensor."""
+    """Return the scores of predictors; ``right`` contains masks of correct slides (slide,) by predictor and sensor.
+
+    Without the mean level there are no comparisons with it.
+    """
     counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
     skill = disagreements = None
     if MEAN_LEVEL in right:
@@ -121,13 +124,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     trained_on = set(classifier.config["trained_on"].values())
     evaluated = {}
     key = classifier.naming.key
-    answers = Answers(
-        classifier,
-        {
-            name: headlines.label_text(recording.attributes.get(key, ""))
-            for name, recording in recordings.recordings.items()
-        },
-    )
+    attributes = {name: recording.attributes for name, recording in recordings.recordings.items()}
+    answers = Answers(classifier, {name: headlines.label_text(own.get(key, "")) for name, own in attributes.items()})
     with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # read, then classify
         for sensor, slides in _read_slides(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
@@ -148,26 +146,21 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **metrics,
         **({"seen": seen.to_json()} if any(seen.slides.values()) else {}),
     }
-    rows = [
-        (sensor, result, int(at))
-        for sensor, result in evaluated.items()
-        for at in np.flatnonzero(result.counted & ~result.in_training)
-    ]
+    rows: list[tuple[str, Evaluated, int]] = []
+    for sensor, result in evaluated.items():
+        rows += [(sensor, result, int(index)) for index in np.flatnonzero(result.counted & ~result.in_training)]
     files = {
         headline.FILE: headline.write(_headlines(evaluated, classifier)),
         "metrics.json": model_files.to_json(tree),
         "confusion.csv": confusion_csv(
             [sensor for sensor, _, _ in rows],
-            [classifier.naming.names_for(result.slides.materials[[at]])[0] for _, result, at in rows],
-            [classifier.naming.names_for(result.predicted[MODEL][[at]])[0] for _, result, at in rows],
+            [classifier.naming.names_for(result.slides.materials[[index]])[0] for _, result, index in rows],
+            [classifier.naming.names_for(result.predicted[MODEL][[index]])[0] for _, result, index in rows],
         ),
         **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
-    table = predictions_table(
-        evaluated, classifier, {name: shard_attributes.get("session") for name, shard_attributes in attributes.items()}
-    )
+    table = predictions_table(evaluated, classifier, {name: own.get("session") for name, own in attributes.items()})
     return Result({PREDICTIONS: RecordingOutput(table, selection.combine_origins(attributes.values()))}, files)
 
 
@@ -179,13 +172,19 @@ def _read_slides(classifier: Classifier, recordings: Dataset, advance: Callable[
 
 
 def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str]) -> Evaluated:
-    """Return the predictions of all predictors for the slides of one sensor."""
+    """Return the predictions of all predictors for the slides of one sensor.
+
+    ``trained_on`` are the digests of training slides. Raises `TacpipeError` for a slide of another class than the
+    model's.
+    """
     sensor = slides.layout.sensor
-    foreign = [index for index, material in enumerate(slides.materials) if int(material) not in classifier.classes]
-    if foreign:
+    other_class_rows = [
+        index for index, material in enumerate(slides.materials) if int(material) not in classifier.classes
+    ]
+    if other_class_rows:
         raise TacpipeError(
-            f"{slides.names[foreign[0]]} is of {classifier.naming.key} "
-            f"{classifier.naming.name(int(slides.materials[foreign[0]]))}, not one of those the model names: "
+            f"{slides.names[other_class_rows[0]]} is of {classifier.naming.key} "
+            f"{classifier.naming.name(int(slides.materials[other_class_rows[0]]))}, not one of those the model names: "
             f"{listed(classifier.names, 20)}. Leave it out."
         )
     output = classifier.readers[sensor].read(slides.frames)
@@ -227,18 +226,12 @@ def _exchanged_predictions(classifier: Classifier, sensor: str, latents: Float32
     """
     scores = _partner_scores(classifier, sensor, latents)
     materials = classifier.best_classes(scores)
-    partners = {
-        int(first_class): int(partner_class)
-        for first_class, partner_class in classifier.config.get("partners", {}).items()
-    }
-    first, partner = next(iter(classifier.layouts)), classifier.partner(sensor)
-    if not partners or first not in (sensor, partner):
+    partner_of = {int(first): int(partner) for first, partner in classifier.config.get("partners", {}).items()}
+    first_sensor, partner_sensor = next(iter(classifier.layouts)), classifier.partner(sensor)
+    if not partner_of or first_sensor not in (sensor, partner_sensor):
         return materials
-    original = (
-        partners
-        if partner == first
-        else {partner_class: first_class for first_class, partner_class in partners.items()}
-    )
+    inverse = {partner: first for first, partner in partner_of.items()}
+    original = partner_of if partner_sensor == first_sensor else inverse
     return np.array([original[int(material)] for material in materials], np.int64)
 
 
@@ -256,7 +249,7 @@ def _zero_shot_predictions(
 
 
 def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> MaterialScores:
-    """Return the metrics on seen or on unseen slides."""
+    """Return the scores on the slides that were ``seen`` in training, or on the others, without held-out ones."""
     masks = {
         sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
     }
@@ -291,7 +284,7 @@ def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> li
 
 
 def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> ZeroShotAccuracy | None:
-    """Return the accuracy of another sensor's classifier on materials whose labels a sensor did not learn."""
+    """Return the accuracy of another sensor's classifier on materials whose labels a sensor did not learn, or None."""
     correct, correct_among_held_out, chances = {}, {}, {}
     for sensor, result in evaluated.items():
         if result.zero_shot is None:
@@ -343,7 +336,7 @@ def predictions_table(
 
 
 def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return one column of scores per material."""
+    """Return a field and the scores (slide,) of each material."""
     metadata = {"quantity": "score"}
     return [
         (pa.field(f"score_{name.zfill(2)}", pa.float32(), metadata=metadata), scores[:, number])
@@ -352,7 +345,7 @@ def score_columns(classifier: Classifier, scores: Float32s) -> list[tuple[pa.Fie
 
 
 def latent_columns(latents: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return one column per latent."""
+    """Return a field and the values (slide,) of each latent."""
     metadata = {"quantity": "latent"}
     return [
         (pa.field(f"z{number + 1:02d}", pa.float32(), metadata=metadata), latents[:, number])

@@ -40,10 +40,10 @@ def headline(
     model: str = "model",
     runs: int = 1,
 ) -> Headline | None:
-    """Return the comparison of a method with its baselines on a sensor's slides.
+    """Return the comparison of a method with its baselines on a sensor's slides, or None without slides.
 
     ``right`` contains, by predictor and then by seed and slide, the numbers of correct and of all classifications.
-    Guessing among ``classes`` is an additional baseline.
+    Guessing among ``classes`` is an additional baseline, unless ``classes`` is 0.
     """
     model_sums = _sums(right.get(model, {}))
     baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
@@ -227,7 +227,7 @@ class Naming:
             return numbers
         return np.array([self.names[number] if number >= 0 else "" for number in numbers.tolist()], dtype=np.str_)
 
-    def write(self, config: StoredNaming) -> None:
+    def add_to_config(self, config: StoredNaming) -> None:
         """Add the naming to a model's configuration; whole numbers under the default key add nothing."""
         if self.key != KEY:
             config["label"] = self.key

@@ -45,7 +45,7 @@ class BatchPairs:
     seed: int = 0  # seed of pairs and orders that are drawn once
 
     def __post_init__(self) -> None:
-        """Raise an error for incompatible options."""
+        """Raise `TacpipeError` for unknown or incompatible options."""
         if self.pairing not in PAIRINGS:
             raise TacpipeError(f"pairing is {self.pairing!r}; it must be {', '.join(PAIRINGS)}.")
         if self.subsample_percent not in (100, 90, *BATCH_STEPS):
@@ -85,8 +85,8 @@ class BatchPairs:
     def _rows(self) -> Tensor:
         """Return the slide of each sensor in each row (sensor, row), in the order of the epoch."""
         seeded = torch.Generator().manual_seed(self.seed)
-        pairs = None if self.pairing != "fixed" and self.shuffle else seeded
-        rows = self._pair_rows(pairs)
+        pair_generator = None if self.pairing != "fixed" and self.shuffle else seeded
+        rows = self._pair_rows(pair_generator)
         order = torch.randperm(rows.shape[1], generator=None if self.shuffle else seeded)
         return rows[:, order]
 
@@ -99,8 +99,8 @@ class BatchPairs:
             members = []
             for classes in self.classes.values():
                 sensor_class = number if classes is first or self.partners is None else self.partners[number]
-                at = (classes == sensor_class).nonzero()[:, 0]
-                members.append(at[torch.randperm(len(at), generator=generator)])
+                class_slides = (classes == sensor_class).nonzero()[:, 0]
+                members.append(class_slides[torch.randperm(len(class_slides), generator=generator)])
             blocks.append(_stack_padded(members))
         for sensor_index, classes in enumerate(self.classes.values()):
             unlabelled = (classes == NONE).nonzero()[:, 0]
@@ -136,7 +136,7 @@ def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
 
 
 def _stack_padded(members: Sequence[Tensor]) -> Tensor:
-    """Stack index tensors as rows of one tensor (member, index), padding the shorter ones with NONE."""
+    """Return index tensors as rows of one tensor (member, index), the shorter ones padded with NONE."""
     longest = max(map(len, members))
     block = torch.full((len(members), longest), NONE)
     for row, indices in zip(block, members, strict=True):
@@ -212,6 +212,7 @@ class JointWork:
         frozen_sensor: str = "",
         drop_last: bool = False,
     ) -> None:
+        """Store the slides of each sensor, their pairs and the weights; ``frozen_sensor`` is not trained."""
         self.training, self.validation, self.pairs, self.weights = training, validation, pairs, weights
         self.frozen_sensor, self.drop_last = frozen_sensor, drop_last
         self._sums = _EpochSums()
@@ -284,7 +285,7 @@ class JointWork:
         return mean
 
     def _contrastive_loss(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
-        """Return the contrastive loss between two sensors' slides of the same class, against all others.
+        """Return the contrastive loss between two sensors' slides of the same class, against all others; None without pairs.
 
         This is the supervised contrastive loss (Khosla et al., Supervised Contrastive Learning, 2020, equation 2)
         between sensors: cosine similarities of latents divided by a temperature, with one term per slide and direction.
@@ -347,6 +348,7 @@ class JointWork:
 
     @torch.no_grad()
     def _evaluate_network(self, network: nn.Module, slides: ScaledSlides) -> dict[str, float]:
+        """Return accuracy and mean losses of a network on labelled slides, NaN without any."""
         labelled = (slides.classes != NONE).nonzero()[:, 0]
         if self.drop_last:
             # fewer slides than a batch are all counted

@@ -37,19 +37,19 @@ def predict(
 
 
 def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: bool = False) -> pa.Table:
-    """Return the table of `predict`; raises the same errors."""
+    """Return the table of `predict`. Raises the same errors."""
     names: list[str] = []
     sensors: list[str] = []
     outputs = []
     answers: list[str] = []
-    likely: list[Float32s] = []
+    probabilities_by_sensor: list[Float32s] = []
     for sensor, slides in classifier.read(recordings).items():
         names += slides.names
         sensors += [sensor] * len(slides)
         outputs.append(classifier.readers[sensor].read(slides.frames))
         if probabilities:
             answers += classifier.answers_from_scores(outputs[-1].scores, slides.frames, sensor)
-            likely.append(classifier.calibrations[sensor].probabilities(outputs[-1].scores))
+            probabilities_by_sensor.append(classifier.calibrations[sensor].probabilities(outputs[-1].scores))
     scores = np.concatenate([output.scores for output in outputs])
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), names),
@@ -58,7 +58,7 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
         *score_columns(classifier, scores),
     ]
     if probabilities:
-        columns += probability_columns(classifier, np.concatenate(likely))
+        columns += probability_columns(classifier, np.concatenate(probabilities_by_sensor))
         columns.append((pa.field("answer", pa.string(), metadata={"quantity": "prediction"}), answers))
     latents = [output.latents for output in outputs if output.latents is not None]
     if latents:
@@ -68,7 +68,7 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
 
 
 def probability_columns(classifier: Classifier, probabilities: Float32s) -> list[tuple[pa.Field, Any]]:
-    """Return one column of calibrated probabilities per material."""
+    """Return a field and the calibrated probabilities (slide,) of each material."""
     return [
         (
             pa.field(f"probability_{name.zfill(2)}", pa.float32(), metadata={"quantity": "probability"}),

@@ -137,6 +137,7 @@ def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
 
 
 def _shape_json(shape: AutoencoderShape) -> StoredShape:
+    """Return the JSON value of a network's shape."""
     return {
         "channels": shape.channels,
         "classes": shape.classes,
@@ -177,6 +178,7 @@ def _files(trained: loop.TrainingResult, config: MaterialConfig, params: Network
 
 
 def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> BatchPairs:
+    """Return the pairs of slides that a training draws in each epoch."""
     return BatchPairs(
         {name: scaled.classes.cpu() for name, scaled in slides.items()},
         params.batch,
@@ -199,7 +201,10 @@ def _scaled_slides(
     device: str,
     index: int,
 ) -> ScaledSlides:
-    """Return slides as network input; held-out classes and classes without training slides have no label."""
+    """Return slides as network input; held-out classes and classes without training slides have no label.
+
+    Raises `TacpipeError` if no label is left.
+    """
     name = slides.layout.sensor
     numbers = {
         material: number
@@ -214,7 +219,7 @@ def _scaled_slides(
 
 
 def _require_same_materials(training_slides: BySensor, naming: Naming) -> None:
-    """Raise an error for joint learning if a sensor lacks a material that another has."""
+    """Raise `TacpipeError` for joint learning if a sensor lacks a material that another has."""
     materials = {
         name: {int(material) for material in sensor_slides.materials} for name, sensor_slides in training_slides.items()
     }
@@ -340,7 +345,7 @@ def train(
     ``use_validation`` it is fitted on them as well. Raises `TacpipeError` if slides lack labels, differ in layout or,
     for joint learning, in materials.
     """
-    _check(params, init)
+    _check_init(params, init)
     only = CommaList().items(params.sensors)
     kinds = slides_of.quantities(params.quantities) or params.QUANTITIES
     naming = _label_naming(params.label, training, validation)
@@ -371,12 +376,11 @@ def train(
         "trained_on": recordings.merge_trained_on(
             *(
                 zip(slides.names, slides.digests, strict=True)
-                for part in (training_slides, validation_slides)
-                for slides in part.values()
+                for slides in (*training_slides.values(), *validation_slides.values())
             )
         ),
     }
-    naming.write(config)
+    naming.add_to_config(config)
     if absent:
         config["absent"] = absent
     return params.fit(TrainingSlides(config, training_slides, validation_slides, naming, workspace, init))
@@ -388,8 +392,8 @@ def _label_naming(key: str, *parts: Dataset | None) -> Naming:
     return Naming.from_labels(key, (shard.attributes.get(key) for shard in shards))
 
 
-def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
-    """Raise an error for an unused initial model, and for a frozen sensor without an initial model."""
+def _check_init(params: Params, init: Mapping[str, bytes] | None) -> None:
+    """Raise `UsageError` for an unused initial model, and for a frozen sensor without an initial model."""
     if init is not None and not params.ALIGNS_SENSORS:
         able = " or ".join(aligning_architectures())
         raise UsageError(

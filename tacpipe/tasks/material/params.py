@@ -323,7 +323,7 @@ class NetworkParams(MaterialModelParams, ABC):
         """
 
     def check(self) -> None:
-        """Raise an error for a subsampled sensor with shuffled batches, and for a percentage without a sensor."""
+        """Raise `UsageError` for a subsampled sensor with shuffled batches, and for a percentage without a sensor."""
         if self.subsample_sensor and self.shuffle:
             raise UsageError(
                 f"subsample_sensor is {self.subsample_sensor} and batches are shuffled, so that this sensor would learn "
@@ -391,7 +391,7 @@ class Raec(NetworkParams):
         return self.pairing
 
     def shape(self, channels: int, header: str, classes: int) -> AutoencoderShape:
-        """Return the sizes of a sensor's network."""
+        """Return the sizes of a sensor's network for its numbers of channels and classes, with this ``header``."""
         return dataclasses.replace(
             super().shape(channels, header, classes),
             decoder=self.decoder,
@@ -419,7 +419,7 @@ class Raec(NetworkParams):
         return RecurrentAutoencoder(shape)
 
     def check(self) -> None:
-        """Raise an error for options of joint learning without joint learning."""
+        """Raise `UsageError` for options of joint learning without joint learning, and as `NetworkParams.check`."""
         super().check()
         if not self.joint:
             options = [(name, getattr(self, name)) for name in ("frozen_sensor", "pairing", "alignment_loss")]

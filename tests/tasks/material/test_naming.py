@@ -44,7 +44,7 @@ def test_any_label_is_a_class_and_none_is_unknown(label: Any, number: int) -> No
 def test_whole_numbers_stay_their_own_names_and_are_written_as_before() -> None:
     naming = Naming.from_labels("material", [20, 3])
     stored: StoredNaming = {}
-    naming.write(stored)
+    naming.add_to_config(stored)
     assert (naming.number(20), naming.name(20), stored) == (20, "20", {})
     assert Naming.from_labels("material", [0.5, -1, 3]).names == ("-1", "0.5", "3")
 

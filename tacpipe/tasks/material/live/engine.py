@@ -90,7 +90,7 @@ class MaterialEngine(Engine):
         self._continues = True
 
     def begin_recording(self, offset_ns: int) -> None:
-        """Start a recording."""
+        """Start a recording whose clock is ``offset_ns`` ahead of the monotonic one, and discard what came before."""
         self._stop_reason, self._continues = RESTARTED if self._continues else "", False
         self._due_ns, self._read_ns = None, 0
         self._decoders, self._tables, self._ended_streams = {}, {}, set()
@@ -130,11 +130,9 @@ class MaterialEngine(Engine):
 
     def due_ns(self, now_ns: int) -> int:
         """Return the monotonic time of the next call of `step`."""
-        return (
-            now_ns + IDLE_NS
-            if self._due_ns is None or self._ended_streams
-            else max(self._due_ns, now_ns + IDLE_NS // 20)
-        )
+        if self._due_ns is None or self._ended_streams:
+            return now_ns + IDLE_NS
+        return max(self._due_ns, now_ns + IDLE_NS // 20)
 
     def step(self, now_ns: int) -> list[MaterialMessage]:
         """Return the final messages of ended slides, followed by the message that is due."""
@@ -166,40 +164,46 @@ class MaterialEngine(Engine):
         """Return the messages for all samples up to a time; a recording's final message uses all samples."""
         began_s = time.perf_counter()
         self._fetch(final=final)
+        end_ns = until_ns
         if final:
-            last = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
-            until_ns = int(max(last, default=self._read_ns))
-        messages = self._final_messages(until_ns)
+            last_ns = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
+            end_ns = int(max(last_ns, default=self._read_ns))
+        messages = self._end_slides(end_ns)
         if not messages or self._finger in self._tables:  # otherwise the next slide has no samples yet
-            messages.append(self._message(until_ns, final=final))
+            messages.append(self._build_message(end_ns, final=final))
         messages[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
         return messages
 
-    def _final_messages(self, until_ns: int) -> list[MaterialMessage]:
+    def _end_slides(self, until_ns: int) -> list[MaterialMessage]:
         """Return the final messages of slides that ended by ``until_ns``, and discard their samples."""
         messages: list[MaterialMessage] = []
         while self._splitter is not None and not self._stop_reason:
             end_ns = self._splitter.end_ns(self._tables, until_ns)
             if end_ns is None:
                 break
-            messages.append(self._message(end_ns, final=True))
+            messages.append(self._build_message(end_ns, final=True))
             self._tables = rows_after(self._tables, end_ns)
             self._number += 1
             self._splitter.begin()
         return messages
 
-    def _message(self, until_ns: int, *, final: bool) -> MaterialMessage:
+    def _build_message(self, until_ns: int, *, final: bool) -> MaterialMessage:
         """Return the message for the slide's samples up to a time."""
         streams = rows_until(self._tables, until_ns)
         newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
-        answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
+        answer = self._predict(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
         self._read_ns = max(self._read_ns, until_ns)
+        state = SLIDING if answer.rows else WAITING
+        if answer.is_over:
+            state = ENDED
+        if final:
+            state = FINAL
         return MaterialMessage(
             self.next_seq(),
             until_ns,
             self._description.channels,
             answer.probabilities,
-            FINAL if final else ENDED if answer.is_over else SLIDING if answer.rows else WAITING,
+            state,
             answer.rows,
             answer.fraction,
             answer.cause,
@@ -209,7 +213,8 @@ class MaterialEngine(Engine):
             slide=self._number,
         )
 
-    def _answer(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
+    def _predict(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
+        """Return the prediction for streams, or why there is none; the finger has been silent for ``silent_ns``."""
         if self._stop_reason:
             return Answer(None, cause=self._stop_reason)
         if self._finger not in streams:
@@ -225,7 +230,7 @@ class MaterialEngine(Engine):
         return self._slide.answer(streams)
 
     def _fetch(self, *, final: bool) -> None:
-        """Append new samples to the stored tables, unless no prediction is possible."""
+        """Append new samples to the stored tables, unless no prediction is possible, and count late ones."""
         import pyarrow as pa
 
         assert self._offset_ns is not None

@@ -126,7 +126,7 @@ class SlideSoFar:
         return self._reader.any_length
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
-        """Return the prediction for a recording of these streams that ends now."""
+        """Return the prediction for a recording of these streams that ends now, or why there is none."""
         recording = RecordingSoFar(streams, self._attributes)
         try:
             segmented = self._stage(replace(self._params, crop="none"), recording)
@@ -142,17 +142,14 @@ class SlideSoFar:
         except TacpipeError as error:
             return Answer(None, rows, 0.0, is_over, str(error))
         answer = Answer(None, rows, min(1.0, len(frames) / self.frames), is_over)
+        differs = f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
         if layout.channels != self._layout.channels or len(frames) > self.frames:
-            return replace(
-                answer, cause=f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
-            )
+            return replace(answer, cause=differs)
         if len(frames) < self.frames and not (self.any_length and answer.fraction >= self._least_fraction):
             enough = f"{self._least_fraction:.0%} of {self.frames}" if self.any_length else str(self.frames)
             return replace(answer, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
         if not is_incomplete and not self._layout.is_compatible(layout):
-            return replace(
-                answer, cause=f"the slide {describe_difference(self._layout, layout)} as the model was trained on"
-            )
+            return replace(answer, cause=differs)
         scores = self._reader.read(frames[None]).scores
         if self._classifier.is_unknown(scores, frames[None], self._sensor)[0]:
             return replace(answer, scores=scores[0], cause=UNLIKE)
@@ -166,8 +163,8 @@ class SlideSoFar:
         With the trigger ``load``, a pause is a time without contact, whatever the arm does; the samples after it start
         without contact, as in a recording. With ``pressure``, it is a time in which the arm has stopped.
         """
-        free = self._params.trigger == "load"
-        tables = {name: table for name, table in streams.items() if not free or name == finger_stream}
+        is_by_load = self._params.trigger == "load"
+        tables = {name: table for name, table in streams.items() if not is_by_load or name == finger_stream}
         if finger_stream not in tables:
             return False
         try:
@@ -281,6 +278,10 @@ def predict(model: Model, recordings: Dataset) -> Result:
 
 
 def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
+    """Return the rows of a recording's slides, as a session with its settings predicted them.
+
+    Raises `TacpipeError` if its streams do not fit the model.
+    """
     tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD_STREAMS}
     attributes = recording.attributes
     table = finger_stream(recording.name, tables)
@@ -297,10 +298,11 @@ def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[R
 
 
 def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
+    """Return the table of predictions, with a probability of each class in ``names``; "unknown" without a prediction."""
     import pyarrow as pa
 
     answers = [answer for *_, answer in rows]
-    likely = np.array(
+    probabilities = np.array(
         [np.full(len(names), np.nan) if answer.probabilities is None else answer.probabilities for answer in answers],
         np.float32,
     ).reshape(len(rows), len(names))
@@ -316,7 +318,10 @@ def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
         (pa.field("material", pa.string(), metadata=metadata), materials),
         (pa.field("cause", pa.string()), [answer.cause for answer in answers]),
         *(
-            (pa.field(f"probability_{name}", pa.float32(), metadata={"quantity": "probability"}), likely[:, number])
+            (
+                pa.field(f"probability_{name}", pa.float32(), metadata={"quantity": "probability"}),
+                probabilities[:, number],
+            )
             for number, name in enumerate(names)
         ),
     ]

@@ -42,7 +42,7 @@ class MaterialLive(LiveTask):
     declaration: ClassVar[Declaration] = DECLARATION
 
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
-        """Return the streams of materials and latencies."""
+        """Return the streams of materials and latencies, and the settings that `predict` needs as attributes."""
         from tacpipe.datasets import model_files
 
         own_settings = _material_settings(settings)
