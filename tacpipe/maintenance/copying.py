@@ -224,8 +224,9 @@ def _expect_room(target: AnyStore, needed_bytes: int) -> None:
     free_bytes = target.room()
     if free_bytes is not None and needed_bytes > free_bytes:
         raise StorageError(
-            f"{needed_bytes / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has {free_bytes / 1e9:,.1f} GB "
-            f"left; nothing was copied. If that is what you expect, free some space; if it came from an untrusted store, do not."
+            f"{needed_bytes / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has "
+            f"{free_bytes / 1e9:,.1f} GB left; nothing was copied. If that is what you expect, "
+            f"free some space; if it came from an untrusted store, do not."
         )
 
 

@@ -43,7 +43,7 @@ Arrays = dict[str, np.ndarray]
 def fit_rockets(
     params: Minirocket, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
-    """Return the files of random convolutions and a readout per sensor."""
+    """Return the files of random convolutions and a readout per sensor. Raises the errors of the classifier's ``fit``."""
     tensors: Arrays = {}
     baselines: Arrays = {}
     for index, (name, slides) in enumerate(training_slides.items()):
@@ -112,17 +112,16 @@ def fit_spectra(
     Raises `TacpipeError` if a sensor's speed or rate is unknown, sensors share too few materials, or a material is
     learned by no sensor.
     """
-    sampled = _samplings(params.speeds, training_slides)
-    bands = Bands.common(list(sampled.values()))
+    samplings = _samplings(params.speeds, training_slides)
+    bands = Bands.common(list(samplings.values()))
     labelled: dict[str, transfer.Labelled] = {}
     baselines: Arrays = {}
     for index, (name, slides) in enumerate(training_slides.items()):
         frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
-        free = ~np.isin(materials, list(held_out[name]))
-        frames, materials = frames[free], materials[free]
-        labelled[name] = transfer.Labelled(
-            bands.log_power(frames, sampled[name].rate_hz, sampled[name].speed_m_s), materials
-        )
+        is_learned = ~np.isin(materials, list(held_out[name]))
+        frames, materials = frames[is_learned], materials[is_learned]
+        spectra = bands.log_power(frames, samplings[name].rate_hz, samplings[name].speed_m_s)
+        labelled[name] = transfer.Labelled(spectra, materials)
         if params.baselines:
             shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
@@ -136,25 +135,23 @@ def fit_spectra(
     config["spectra"] = {
         "way_m": bands.distance_m,
         "edges_per_m": bands.edges_per_m.tolist(),
-        "speed_m_s": {name: sampling.speed_m_s for name, sampling in sampled.items()},
+        "speed_m_s": {name: sampling.speed_m_s for name, sampling in samplings.items()},
     }
     config["held_out"] = {
         name: sorted(set(config["classes"]) - learned_materials) for name, learned_materials in learned.items()
     }
-    tensors = {
-        f"{name}.{key}": value
-        for name, training_spectra in labelled.items()
-        for key, value in Transfer.fit(training_spectra, [labelled[other] for other in labelled if other != name])
-        .to_tensors()
-        .items()
-    }
+    tensors: Arrays = {}
+    for name, training_spectra in labelled.items():
+        fitted = Transfer.fit(training_spectra, [labelled[other] for other in labelled if other != name])
+        tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
     return _files(config, tensors, baselines)
 
 
 def _samplings(speeds: str, training_slides: BySensor) -> dict[str, Sampling]:
     """Return the sampling of each sensor's slides, at their median recorded speed.
 
-    ``speeds``, such as ``biotac=0.025,roboskin=0.05``, is used for sensors whose slides have no recorded speed.
+    ``speeds``, such as ``biotac=0.025,roboskin=0.05``, is used for sensors whose slides have no recorded speed. Raises
+    `UsageError` if it lacks one, and `TacpipeError` if slides have no rate.
     """
     stated_speeds = Assignments(float).items(speeds)
     samplings = {}
@@ -180,7 +177,10 @@ def _training_arrays(
     validation_slides: Slides | None,
     index: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames and materials for training, with those of validation if the params request them."""
+    """Return the frames and materials for training, with those of validation if the params request them.
+
+    Materials are permuted if ``params`` say so; ``index`` is the sensor's.
+    """
     frames, materials = training_slides.frames, permute_labels(params, training_slides.materials, index)
     if params.use_validation and validation_slides is not None and params.labels == "true":
         frames = np.concatenate([frames, validation_slides.frames])

@@ -62,7 +62,7 @@ class ClassDistance:
 
     @classmethod
     def fit(cls, frames: Float32s, labels: Ints) -> Self:
-        """Fit the distance to classes on slides (slide, time, channel) with ``labels`` (slide,).
+        """Return the distance to classes fitted on slides (slide, time, channel) with ``labels`` (slide,).
 
         Raises `TacpipeError` as `Rocket.fit`.
         """
@@ -262,12 +262,12 @@ def fit_calibration(
 
 def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
     """Return the file content of calibrations by sensor."""
-    tensors = {
-        f"{name}.{key}": value
-        for name, sensor_calibration in calibrations.items()
-        for key, value in sensor_calibration.to_tensors().items()
-    }
-    return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
+    tensors: dict[str, AnyArray] = {}
+    for name, sensor_calibration in calibrations.items():
+        tensors |= {
+            f"{name}.{key}": np.ascontiguousarray(value) for key, value in sensor_calibration.to_tensors().items()
+        }
+    return save(tensors)
 
 
 def unpack_calibrations(content: bytes, sensors: Iterable[str]) -> dict[str, SensorCalibration]:
@@ -278,10 +278,12 @@ def unpack_calibrations(content: bytes, sensors: Iterable[str]) -> dict[str, Sen
 
 def _log_odds(scores: AnyFloats) -> Floats:
     """Return log(p / (1 - p)) of the highest probability p of each slide (slide,)."""
-    wide = scores.astype(np.float64)
-    best = wide.argmax(axis=1)[:, None]
-    other_scores = wide.copy()
+    floats = scores.astype(np.float64)
+    best = floats.argmax(axis=1)[:, None]
+    other_scores = floats.copy()
     np.put_along_axis(other_scores, best, -np.inf, axis=1)
     remainder = logsumexp(other_scores, axis=1)
-    log_odds: Floats = np.take_along_axis(wide, best, axis=1)[:, 0] - np.where(np.isfinite(remainder), remainder, -1e6)
+    log_odds: Floats = np.take_along_axis(floats, best, axis=1)[:, 0] - np.where(
+        np.isfinite(remainder), remainder, -1e6
+    )
     return log_odds

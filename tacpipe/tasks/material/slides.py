@@ -77,14 +77,14 @@ class Slides:
 
     def select(self, mask: Bools) -> Slides:
         """Return the slides selected by a mask (slide,)."""
-        at = np.flatnonzero(mask)
+        rows = np.flatnonzero(mask)
         return Slides(
             self.layout,
-            tuple(self.names[i] for i in at),
-            self.frames[at],
-            self.materials[at],
-            tuple(self.digests[i] for i in at),
-            self.speeds_m_s[at],
+            tuple(self.names[row] for row in rows),
+            self.frames[rows],
+            self.materials[rows],
+            tuple(self.digests[row] for row in rows),
+            self.speeds_m_s[rows],
         )
 
 
@@ -145,7 +145,7 @@ def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[st
 
 
 def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[SlideLayout, Float32s]:
-    """Return the layout of a slide and its frames (time, channel) in device counts; raises as `read`."""
+    """Return the layout of a slide and its frames (time, channel) in device counts. Raises the errors of `read`."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has the streams {', '.join(shard.streams)} and none is a slide. "
@@ -187,7 +187,7 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
 def _stack_slides(
     sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool
 ) -> Slides:
-    """Return the slides of one sensor, after a check that their layouts are compatible."""
+    """Return the slides of one sensor. Raises `TacpipeError` if their layouts are not compatible, or as `_material`."""
     first, layout, _ = sensor_slides[0]
     for shard, compared, _ in sensor_slides:
         if not layout.is_compatible(compared):
@@ -234,7 +234,10 @@ def _require_label(shard: Recording, key: str) -> None:
 
 
 def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
-    """Return the class number of a slide; `UNKNOWN` without a label or, unless ``labelled``, for an unlisted label."""
+    """Return the class number of a slide; `UNKNOWN` without a label or, unless ``labelled``, for an unlisted label.
+
+    Raises `TacpipeError` for an unlisted label if ``labelled``.
+    """
     label = shard.attributes.get(naming.key)
     try:
         return naming.number(label)

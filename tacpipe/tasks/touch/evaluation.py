@@ -101,13 +101,15 @@ def reading_measures(
         "n": len(clusters),
     }
     for target, values in predicted.items():
-        true, share, mean = (biotac_sp.normalise(target, counts[target]) for counts in (readings, predicted, constant))
-        measures["rmse"][target] = regression.rmse(true, share)
+        true, model_share, constant_share = (
+            biotac_sp.normalise(target, counts[target]) for counts in (readings, predicted, constant)
+        )
+        measures["rmse"][target] = regression.rmse(true, model_share)
         measures["rmse_counts"][target] = regression.rmse(readings[target], values)
-        measures["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, share)
-        measures["mae"][target] = regression.mae(true, share)
-        measures["r2"][target] = _finite(regression.r2(true, share))
-        model, baseline = (regression.squared_sums(true, share_of_range) for share_of_range in (share, mean))
+        measures["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, model_share)
+        measures["mae"][target] = regression.mae(true, model_share)
+        measures["r2"][target] = _finite(regression.r2(true, model_share))
+        model, baseline = (regression.squared_sums(true, share) for share in (model_share, constant_share))
         skill, low, high = map(_finite, regression.skill_interval(model, baseline, np.asarray(clusters)))
         measures["skill"][target], measures["skill_low"][target], measures["skill_high"][target] = skill, low, high
     return measures
@@ -154,7 +156,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 def _evaluation_result(
     model: Mapping[str, bytes], predictor: Predictor, grasps: Grasps, recordings: Dataset, advance: Callable[..., None]
 ) -> Result:
-    """Return the result of a model on grasps; ``advance`` updates the progress bar after their prediction."""
+    """Return the result of a model on grasps; ``advance`` updates the progress bar after their prediction.
+
+    Raises `TacpipeError` if there are no grasps or the model has no baselines.
+    """
     if not len(grasps):
         raise TacpipeError(
             "There is no grasp to evaluate the model on. Give a dataset with recordings of the requested role."
@@ -228,7 +233,7 @@ def _headlines(
             errors = {}
             for name, readings in predicted.items():
                 squared = regression.squared_sums(true, biotac_sp.normalise(target, readings[target]))
-                errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
+                errors[name] = {(0, grasps.names[row]): (float(squared[row]), true.shape[1]) for row in rows}
             model = errors.pop(MODEL)
             low, high = biotac_sp.RANGES[target]
             target_headline = headlines.headline(
@@ -288,7 +293,7 @@ def _object_csv(scores: TouchScores) -> bytes:
 
 
 def _grasp_table(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
-    """Return one row per grasp: recording, object, session, time, and whether grasp and object are known."""
+    """Return one row per grasp: recording, object, session, time, and whether it was in training and its object is known."""
     return pa.table(
         {
             "recording": pa.array(grasps.names, pa.string()),
@@ -307,20 +312,18 @@ def simulated(recordings: Dataset) -> dict[str, bool]:
 
 
 def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = None) -> pa.Table:
-    """Return one row per grasp with ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` if predicted.
-
-    Float32, device counts.
+    """Return one row per grasp with ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` if predicted, float32, device counts.
 
     ``bands`` contains quantiles by level in percent. Their columns, such as ``e_th_01_q90``, follow that of the value.
     """
     fields, arrays = [], []
     for target, values in predicted.items():
-        for at, (name, column) in enumerate(zip(biotac_sp.value_columns(target), values.T, strict=True)):
+        for index, (name, column) in enumerate(zip(biotac_sp.value_columns(target), values.T, strict=True)):
             metadata = {"unit": "count", "quantity": "prediction"}
             fields.append(pa.field(name, pa.float32(), metadata=metadata))
             arrays.append(pa.array(column.astype(np.float32)))
             for percent, band in (bands or {}).items():
                 level = {**metadata, "quantile": f"{percent / 100:g}"}
                 fields.append(pa.field(f"{name}_q{percent}", pa.float32(), metadata=level))
-                arrays.append(pa.array(band[target][:, at].astype(np.float32)))
+                arrays.append(pa.array(band[target][:, index].astype(np.float32)))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

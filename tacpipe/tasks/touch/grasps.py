@@ -69,7 +69,7 @@ def read(recordings: Dataset, *, with_readings: bool = True, advance: Callable[.
     clouds, grasps, t_ns = [], [], []
     readings: dict[str, list[Floats]] = {target: [] for target in biotac_sp.TARGETS}
     for shard in shards:
-        cloud, grasp, stamp = _geometry(shard)
+        cloud, grasp, stamp = _read_geometry(shard)
         clouds.append(cloud)
         grasps.append(grasp)
         t_ns.append(stamp)
@@ -105,7 +105,11 @@ def check(name: str, cloud: Cloud, grasp: Grasp) -> None:
             )
 
 
-def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
+def _read_geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
+    """Return the cloud, the grasp and its time in ns.
+
+    Raises `TacpipeError` if a stream or column is missing or invalid.
+    """
     missing = [stream for stream in STREAMS if stream not in shard.streams]
     if missing:
         raise TacpipeError(
@@ -123,6 +127,7 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
 
 
 def _read_targets(shard: Recording) -> dict[str, Floats]:
+    """Return the values of each target in a grasp's reading. Raises `TacpipeError` if it is missing or not finite."""
     if READING not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has no tactile reading to learn from or to evaluate with. `tacpipe predict` needs none."

@@ -37,11 +37,11 @@ def headline(
     objects: Mapping[str, str],
     runs: int = 1,
 ) -> Headline | None:
-    """Return the comparison of a method with its baselines on one target.
+    """Return the comparison of a method with its baselines on one target, or None without grasps.
 
     Errors are stored by seed and grasp as (sum of squares, number of values), the squares in fractions of the target's
-    range ``range_counts``. The bootstrap resamples grasps if objects are known, otherwise ``objects`` (grasp ->
-    object).
+    range ``range_counts``. The interval is over grasps if objects are known, otherwise over ``objects`` (grasp ->
+    object). ``known_objects`` is None for grasps of both.
     """
     clusters = None if known_objects else objects
     compared = {BASELINES.get(name, name.replace("_", " ")): _sums(sums) for name, sums in baselines.items() if sums}

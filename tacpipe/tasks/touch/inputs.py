@@ -111,14 +111,18 @@ class CloudSources:
         return self._arrays(list(zip(indices, rngs, strict=True)), 0.0)
 
     def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]], largest_deg: float) -> Arrays:
+        """Return the network's input for grasps, each given as an index and a random generator: points and numbers.
+
+        Points (grasp, point, channel) are drawn, rotated by up to ``largest_deg`` and normalised.
+        """
         inputs = self.inputs
         points = np.empty((len(draws), inputs.points, inputs.channels), np.float32)
         numbers = np.empty((len(draws), inputs.grasp_numbers), np.float32)
         for row, (index, rng) in enumerate(draws):
             cloud, grasp, extent = self.clouds[index], self.grasps[index], self.extents[index]
             rotation = random_rotation(rng, largest_deg)
-            wrist = self.wrists[index]
-            wrist = None if wrist is None else rotation @ wrist
+            own_wrist = self.wrists[index]
+            wrist = None if own_wrist is None else rotation @ own_wrist
             indices = rng.choice(len(cloud), inputs.points, replace=False, shuffle=False)
             positions = np.concatenate([cloud.points_m[indices], grasp.g1_m[None], grasp.g2_m[None]]) @ rotation.T
             positions = normalise(inputs.normalisation, positions, extent, rotation, wrist)
@@ -135,6 +139,7 @@ class CloudSources:
 
 
 def _check(inputs: CloudInputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
+    """Raise `TacpipeError` if a cloud lacks points or required colours, or a grasp a required wrist."""
     if len(cloud) < inputs.points:
         raise TacpipeError(
             f"{name} has a cloud of {len(cloud)} points, and {inputs.points} are to be drawn of each. Leave it out, or "
@@ -220,6 +225,7 @@ class PatchSources:
         return self._arrays(list(zip(indices, rngs, strict=True)))
 
     def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]]) -> Arrays:
+        """Return the drawn points of the patches (grasp, patch, point, channel), and the numbers of the grasps."""
         count = self.patches.points
         points = np.empty((len(draws), PATCH_COUNT, count, self.patches.channels), np.float32)
         for row, (index, rng) in enumerate(draws):
@@ -238,14 +244,14 @@ def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
             )
 
 
-def _contact_indices(points: Floats, place_m: float, radius_m: float) -> Indices:
+def _contact_indices(points: Floats, contact_m: float, radius_m: float) -> Indices:
     """Return the indices of the points (point, xyz) within a radius of a contact, or of the nearest point.
 
-    ``place_m`` is the contact's position along y, the closing axis.
+    ``contact_m`` is the contact's position along y, the closing axis.
     """
-    away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
-    inside = np.flatnonzero(away <= radius_m)
-    return inside if len(inside) else np.array([int(away.argmin())])
+    distances = np.linalg.norm(points - np.array([0.0, contact_m, 0.0]), axis=1)
+    near = np.flatnonzero(distances <= radius_m)
+    return near if len(near) else np.array([int(distances.argmin())])
 
 
 def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices:
@@ -257,6 +263,7 @@ def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices
 
 
 def _grasp_features(grasps: Sequence[Grasp], with_position: bool) -> Float32s:
+    """Return the opening of each grasp and, with its position, `geometry.pose_features` (grasp, number)."""
     rows = [
         [grasp.opening_m / UNIT_M] + (list(geometry.pose_features(grasp).values()) if with_position else [])
         for grasp in grasps

@@ -80,16 +80,18 @@ def repeatability(
     if not len(first):
         return Repeatability(0, NOTHING, NOTHING)
     squared = np.square(values[first] - values[second]).sum(axis=1)  # (pair,)
-    kind = np.unique(np.asarray(objects), return_inverse=True)[1]
+    object_index = np.unique(np.asarray(objects), return_inverse=True)[1]
 
     def estimates(weight: Floats) -> tuple[float, float]:
-        variance_within, total = variances(values, kind, weight)
+        variance_within, total = variances(values, object_index, weight)
         counts = weight[first] * weight[second]
-        expected = float((counts * variance_within[kind[first]]).sum())
+        expected = float((counts * variance_within[object_index[first]]).sum())
         if expected <= 0 or total <= 0:
             return math.nan, math.nan
         ratio = float((counts * squared).sum()) / 2 / expected
-        return 1 - ratio, 1 - math.sqrt(ratio * float(np.average(variance_within[kind], weights=weight)) / total)
+        return 1 - ratio, 1 - math.sqrt(
+            ratio * float(np.average(variance_within[object_index], weights=weight)) / total
+        )
 
     rng, count = np.random.default_rng(seed), len(values)
     weights = [np.bincount(rng.integers(0, count, count), minlength=count).astype(np.float64) for _ in range(RESAMPLES)]
@@ -102,20 +104,20 @@ def repeatability(
     return Repeatability(len(first), *(Estimate(*map(float, ends)) for ends in zip(means, low, high, strict=True)))
 
 
-def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, float]:
+def variances(values: Floats, object_index: Indices, weight: Floats) -> tuple[Floats, float]:
     """Return the variances of values (grasp, value) about each object's mean (object,) and about the overall mean.
 
-    ``kind`` (grasp,) contains object indices, and ``weight`` (grasp,) the count of each grasp. Variances are summed
-    over values. The variance within an object is unbiased, and 0 if the object's total count is below 2.
+    ``object_index`` (grasp,) contains object indices, and ``weight`` (grasp,) the count of each grasp. Variances are
+    summed over values. The variance within an object is unbiased, and 0 if the object's total count is below 2.
     """
-    objects = int(kind.max()) + 1
-    counts = np.bincount(kind, weight, objects)
+    objects = int(object_index.max()) + 1
+    counts = np.bincount(object_index, weight, objects)
     sums = np.zeros((objects, values.shape[1]))
-    np.add.at(sums, kind, weight[:, None] * values)
+    np.add.at(sums, object_index, weight[:, None] * values)
     means = sums / np.maximum(counts, 1)[:, None]
-    squared_deviations = weight * np.square(values - means[kind]).sum(axis=1)
+    squared_deviations = weight * np.square(values - means[object_index]).sum(axis=1)
     variance_within = np.where(
-        counts > 1, np.bincount(kind, squared_deviations, objects) / np.maximum(counts - 1, 1), 0.0
+        counts > 1, np.bincount(object_index, squared_deviations, objects) / np.maximum(counts - 1, 1), 0.0
     )
     centre = np.average(values, axis=0, weights=weight)
     return variance_within, float(np.average(np.square(values - centre).sum(axis=1), weights=weight))
@@ -124,7 +126,7 @@ def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, fl
 def table(
     readings: Mapping[str, Floats], contacts_m: Floats, objects: Sequence[str]
 ) -> list[tuple[float, float, dict[str, Repeatability]]]:
-    """Return the bounds of each distance bin in mm and `repeatability` by target."""
+    """Return the bounds of each distance bin in mm, low and high, and `repeatability` by target."""
     pairs = Pairs.from_contacts(contacts_m, objects)
     return [
         (low, high, {name: repeatability(values, objects, pairs, low, high) for name, values in readings.items()})
@@ -166,21 +168,22 @@ class Limits:
 
     def to_json(self) -> Json:
         """Return all limits for JSON; NaN and the upper bound of the last distance bin become null."""
+        repeatability = [
+            {
+                "low_mm": low,
+                "high_mm": None if math.isinf(high) else high,
+                "pairs": max((estimates.pairs for estimates in by_target.values()), default=0),
+                "likeness": {name: _estimate_json(estimates.likeness) for name, estimates in by_target.items()},
+                "pair_skill": {name: _estimate_json(estimates.pair_skill) for name, estimates in by_target.items()},
+            }
+            for low, high, by_target in self.near
+        ]
         return {
             "grasps": dict(self.counts),
             "draws": self.draws,
             "folds": FOLDS,
             "trees": self.trees,
-            "repeatability": [
-                {
-                    "low_mm": low,
-                    "high_mm": None if math.isinf(high) else high,
-                    "pairs": max((estimates.pairs for estimates in by_target.values()), default=0),
-                    "likeness": {name: _estimate_json(estimates.likeness) for name, estimates in by_target.items()},
-                    "pair_skill": {name: _estimate_json(estimates.pair_skill) for name, estimates in by_target.items()},
-                }
-                for low, high, by_target in self.near
-            ],
+            "repeatability": repeatability,
             "learning_curve": [
                 {"grasps": point.grasps, "trained": point.trained, "skill": _skills_json(point.skill)}
                 for point in self.curve
@@ -254,6 +257,10 @@ class _Trial:
         return self._skills(len(self.grasps), rows, "other finger")[0]
 
     def _skills(self, size: int, rows: Mapping[str, Floats], note: str) -> tuple[Skills, float]:
+        """Return the skill of forests of ``rows`` by target, over draws and folds, and the mean number of training grasps.
+
+        ``size`` is the maximum number of training grasps per object, and ``note`` a text for the progress bar.
+        """
         readings = self.grasps.readings
         squared = {name: np.zeros((2, len(self.grasps))) for name in readings}  # (model or constant, grasp)
         trained = []
@@ -270,8 +277,8 @@ class _Trial:
                         rows[name][sample], values[sample], trees=self.trees, leaf=leaf, seed=self.seed + draw
                     )
                     constant = np.tile(values[trained_on].mean(axis=0), (len(tested), 1))
-                    for at, predicted in enumerate((forest.predict(rows[name][tested]), constant)):
-                        squared[name][at, tested] += regression.squared_sums(values[tested], predicted)
+                    for index, predicted in enumerate((forest.predict(rows[name][tested]), constant)):
+                        squared[name][index, tested] += regression.squared_sums(values[tested], predicted)
                 self.advance(note=note)
         clusters = np.arange(len(self.grasps))
         skills = {

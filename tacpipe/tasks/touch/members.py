@@ -103,6 +103,10 @@ class TouchWork:
         return {"": (float(line["val_loss"]),)}
 
     def _loss(self, predicted: Tensor, values: Tensor) -> Tensor:
+        """Return the loss of predicted values (grasp, value).
+
+        Raises `TacpipeError` if the network returns another shape.
+        """
         if predicted.shape != values.shape:
             raise TacpipeError(
                 f"The network returns {tuple(predicted.shape)} for {len(values)} grasps; it must return (cloud, value), "

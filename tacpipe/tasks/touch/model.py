@@ -43,8 +43,8 @@ def predict(
 
 
 def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
-    """Return the table of `predict`; raises the same errors."""
-    at = predictor.quantiles_of(quantiles)[1] if quantiles else []
+    """Return the table of `predict`. Raises the same errors."""
+    level_indices = predictor.quantiles_of(quantiles)[1] if quantiles else []
     grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
         raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the requested role.")
@@ -54,7 +54,7 @@ def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[i
         quantile_readings = predictor.quantiles.quantiles(predicted)
         bands = {
             percent: {target: values[..., level] for target, values in quantile_readings.items()}
-            for percent, level in zip(quantiles, at, strict=True)
+            for percent, level in zip(quantiles, level_indices, strict=True)
         }
     table = readings_table(predicted, bands)
     return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

@@ -221,7 +221,7 @@ class Patches(PointNetwork):
         return PatchOptions(self.points, self.radius_mm / 1000, self.inputs == "rgb", self.place)
 
     def build(self, shape: PointNetworkShape) -> nn.Module:
-        """Return the patch network."""
+        """Return the patch network for inputs and outputs of this shape, with random weights."""
         from tacpipe.models.point_networks import PatchNetwork
 
         return PatchNetwork(

@@ -77,7 +77,7 @@ class Baselines:
                 for name, values in self.readings.items()
             },
             NEAREST_IN_TIME: {
-                name: np.array([values[at].mean(axis=0) for at in nearest]).reshape(len(grasps), -1)
+                name: np.array([values[rows].mean(axis=0) for rows in nearest]).reshape(len(grasps), -1)
                 for name, values in self.readings.items()
             },
         }
@@ -228,9 +228,8 @@ class Predictor:
                 stored = model_files.arrays(files[BASELINES], BASELINES, but="")
                 baselines = Baselines.from_tensors(stored, tuple(config["learned_objects"]))
                 baselines.check()
-            if not config["targets"] or {*config["targets"]} != {
-                target for one in loaded_members for target in one.targets
-            }:
+            predicted_targets = {target for member in loaded_members for target in member.targets}
+            if not config["targets"] or {*config["targets"]} != predicted_targets:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
             shrunk = {name: value.numpy() for name, value in tensors_under(SHRINKAGE, tensors).items()}
             shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
@@ -281,12 +280,12 @@ class Predictor:
             readings[target] = np.full((count, biotac_sp.width(target)), np.nan)
         return [
             PredictedReading(
-                float(readings["pdc_th"][at, 0]),
-                float(readings["pdc_mf"][at, 0]),
-                readings["e_th"][at],
-                readings["e_mf"][at],
+                float(readings["pdc_th"][index, 0]),
+                float(readings["pdc_mf"][index, 0]),
+                readings["e_th"][index],
+                readings["e_mf"][index],
             )
-            for at in range(count)
+            for index in range(count)
         ]
 
 
@@ -304,7 +303,10 @@ class StoredMember:
         return tuple(self.description["targets"])
 
     def forests(self) -> members.ForestMember:
-        """Return the forests of groups of targets. Raises `ValueError` if it is anything else."""
+        """Return the forests of groups of targets.
+
+        Raises ``ValueError`` for another kind, or if they do not fit the targets.
+        """
         description, targets = self.description, self.targets
         if description["kind"] != FOREST:
             raise ValueError(f"a member is a {excerpt(description['kind'])}")
@@ -321,7 +323,10 @@ class StoredMember:
         )
 
     def network(self, params: PointNetwork) -> members.NetworkMember:
-        """Return the network that ``params`` build. Raises `ValueError` if its sizes do not fit."""
+        """Return the network that ``params`` build, with the stored weights.
+
+        Raises ``ValueError`` if its sizes do not fit.
+        """
         width = sum(biotac_sp.width(target) for target in self.targets)
         stored_scale = tensors_under("scale.", self.tensors)
         scale = Affine.from_tensors({name: value.numpy() for name, value in stored_scale.items()})

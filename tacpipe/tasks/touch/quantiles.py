@@ -157,12 +157,12 @@ def _sums(
     fitted: ReadingQuantiles,
     grasps: Grasps,
     predicted: Mapping[str, Readings],
-    about: tuple[str, str],
+    predictor_and_target: tuple[str, str],
     mask: Bools,
     clusters: np.ndarray[Any, np.dtype[np.str_]],
 ) -> list[Sums]:
-    """Return the sums over the values of each cluster of grasps, for a predictor and target."""
-    predictor, target = about
+    """Return the sums over the values of each cluster of grasps, for a predictor and target, ``about``."""
+    predictor, target = predictor_and_target
     bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
     truth = grasps.readings[target][mask]
     return [
@@ -174,19 +174,22 @@ def _sums(
 
 
 def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
-    """Return the quantiles (level,) of errors (grasp, value), with equal weight for each grasp."""
+    """Return the quantiles (level,) of errors (grasp, value), with equal weight for each grasp.
+
+    Raises `TacpipeError` if they are to be ``promised`` and there are too few grasps.
+    """
     groups = np.repeat(np.arange(len(errors)), errors.shape[1])
     flat, middle = errors.ravel(), len(levels) // 2
     offsets = np.zeros(len(levels))
-    for at, level in enumerate(levels):
-        if not promised or at == middle:
-            offsets[at] = calibration.conformal_quantile(flat, groups, float(level))
+    for index, level in enumerate(levels):
+        if not promised or index == middle:
+            offsets[index] = calibration.conformal_quantile(flat, groups, float(level))
     if promised:
-        away = np.abs(flat - offsets[middle])
+        distances = np.abs(flat - offsets[middle])
         for low in range(middle):
             level = float(levels[-1 - low] - levels[low])
-            far = calibration.promised_quantile(away, groups, level, "grasps")
-            offsets[low], offsets[-1 - low] = offsets[middle] - far, offsets[middle] + far
+            distance = calibration.promised_quantile(distances, groups, level, "grasps")
+            offsets[low], offsets[-1 - low] = offsets[middle] - distance, offsets[middle] + distance
     return offsets
 
 

@@ -51,11 +51,11 @@ class TrainingGrasps:
 
     def grow_forests(self, params: Trees, model: FittedModel) -> None:
         """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets."""
-        _grow_forests(params, self, model)
+        _add_forests(params, self, model)
 
     def train_networks(self, params: PointNetwork, model: FittedModel) -> None:
         """Add networks to ``model`` that the shared loop trains."""
-        _train_networks(params, self, model)
+        _add_networks(params, self, model)
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,11 @@ def _config(params: Params, targets: Sequence[str], training: Grasps, validation
     }
 
 
-def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> None:
+def _add_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> None:
     """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets with shared splits.
 
-    The leaf size of each forest minimises the out-of-bag error.
+    The leaf size of each forest minimises the out-of-bag error. With ``shrink_novel``, the shrinkage is fitted, too.
+    Raises `TacpipeError` if colours are missing.
     """
     training, targets = grasps.training, grasps.targets
     if params.coloured:
@@ -192,8 +193,11 @@ def _best_leaf_size(rows: Floats, values: Floats, params: Trees) -> int:
     return fitting[int(np.argmin(errors))]
 
 
-def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedModel) -> None:
-    """Add networks to ``model``, ``networks`` of each: one for all targets, or one per target."""
+def _add_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedModel) -> None:
+    """Add networks to ``model``, ``networks`` of each: one for all targets, or one per target.
+
+    Raises `TacpipeError` if validation grasps are needed and missing.
+    """
     training, validation, targets = grasps.training, grasps.validation, grasps.targets
     if validation is None and params.chooses_by_validation:
         raise TacpipeError(
@@ -205,7 +209,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
     validation_sources = (members.sources(params, validation), validation) if validation else training_sources
     parameters = 0
     groups = [tuple(targets)] if params.multi_target else [(target,) for target in targets]
-    for at, group in enumerate(groups):
+    for index, group in enumerate(groups):
         scale = _output_scale(training, group, params.loss)
         work = _network_work(params, scale, (training_sources, validation_sources), group, device)
         for number in range(params.networks):
@@ -222,7 +226,7 @@ def _train_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedM
                 schedule,
                 folder,
                 weight_decay=params.weight_decay,
-                number=at * params.networks + number + 1,
+                number=index * params.networks + number + 1,
                 count=len(groups) * params.networks,
                 labels=labels,
             )

@@ -39,7 +39,7 @@ class MaterialReport(TaskReport):
         return figures.holds_slides(dataset)
 
     def outcomes(self, run: ComparedRun) -> Sequence[RecordingOutcome]:
-        """Return whether the model named each unseen slide right."""
+        """Return for each unseen slide its label, the predicted class, and whether they are equal."""
         predictions = run.details.predictions
         expected = predictions.named(predictions.materials)
         predicted = predictions.named(predictions.predicted[MODEL])
@@ -51,12 +51,9 @@ class MaterialReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return counts, last epoch, skill over the mean level, and the numbers of the paper."""
+        """Return counts, skill over the mean level, last epoch and the paper's numbers: heads and functions of a row."""
         runs = [run for run in context.runs if comparison.question in run.questions]
-        sensors = (
-            sensor for run in runs for sensor in run.details.sensors if question_on(run, sensor) == comparison.question
-        )
-        sensor = next(sensors)
+        sensor = next(s for run in runs for s in run.details.sensors if question_on(run, s) == comparison.question)
 
         def runs_of(row: ComparisonRow) -> list[ComparedRun]:
             return row.method.of(comparison.question)
@@ -85,7 +82,7 @@ class MaterialReport(TaskReport):
         return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
 
     def folds(self, context: Context) -> list[Fold]:
-        """Return the sections that are specific to materials."""
+        """Return the folds that are specific to materials."""
         methods = context.methods
         return [
             *blocks.fold(
@@ -108,9 +105,14 @@ class MaterialReport(TaskReport):
     def caveats(self, context: Context) -> list[str]:
         """Return the caveats of the reported results; an empty list if there are no methods."""
         methods = context.methods
-        return (
-            [_basis(methods), _describe_pooling(methods), scores.caution(methods), _not_run(methods)] if methods else []
-        )
+        if not methods:
+            return []
+        return [
+            _describe_basis(methods),
+            _describe_pooling(methods),
+            scores.caution(methods),
+            _describe_not_run(methods),
+        ]
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
         """Return additional columns of the table of runs."""
@@ -151,7 +153,7 @@ def _describe_pooling(methods: Sequence[Method]) -> str:
     return " ".join(filter(None, sentences))
 
 
-def _basis(methods: Sequence[Method]) -> str:
+def _describe_basis(methods: Sequence[Method]) -> str:
     """Return a description of the data of all methods: slides, training slides, and settings."""
     sentences = []
     for sensor in sensors_of(methods):
@@ -169,7 +171,7 @@ def _basis(methods: Sequence[Method]) -> str:
     return f"Evaluated on {blocks.listed(sentences)}.{f' Settings: {settings_text}.' if settings_text else ''}"
 
 
-def _not_run(methods: Sequence[Method]) -> str:
+def _describe_not_run(methods: Sequence[Method]) -> str:
     """Return the published numbers of methods that were not run, if the slides are those of the paper."""
     if not all(method.published for method in methods):
         return ""

@@ -53,7 +53,7 @@ def confusion_folds(context: Context) -> list[Fold]:
 
 
 def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
-    """Return the confusion counts (material, predicted), pooled over runs, and the materials."""
+    """Return the confusion counts (material, predicted), pooled over runs, and the names of the materials."""
     import pandas as pd
 
     tables = []
@@ -83,6 +83,7 @@ def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
 
 
 def _confusion_chart(method: Method, sensor: str) -> Chart:
+    """Return the confusion matrix of a method on a sensor's slides, with its accuracy and worst confusions."""
     counts, materials = count_confusions(method, sensor)
     runs = len(runs_on(method, sensor))
     label = runs_on(method, sensor)[0].details.predictions.naming.key
@@ -109,9 +110,8 @@ def validation_charts(methods: Sequence[Method]) -> list[Chart]:
     Empty if there are no epochs.
     """
     networks = [method for method in methods if has_usual_settings(method.settings)]
-    shown_methods = [
-        method for family in ("RAEC joint", "RAEC independent") for method in networks if method.family == family
-    ]
+    families = ("RAEC joint", "RAEC independent")
+    shown_methods = sorted((m for m in networks if m.family in families), key=lambda m: families.index(m.family))
     order = [method.name for method in shown_methods]
     figures = []
     for sensor in sensors_of(shown_methods):
@@ -170,19 +170,15 @@ def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
             if fewer == {sensor}:  # this line ends at the full number of slides of all sensors
                 loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
                 for candidate in shown_methods:
-                    if has_usual_settings(candidate.settings) and candidate.key_without(*loose) == method.key_without(
-                        *loose
-                    ):
+                    is_same = candidate.key_without(*loose) == method.key_without(*loose)
+                    if is_same and has_usual_settings(candidate.settings):
                         _add_points(points, method_title(method), candidate, sensor)
         drawn_points = {name: candidate for name, candidate in sorted(points.items()) if len(candidate) > 1}
         if drawn_points:
             lines = []
-            for name, counts_and_accuracies in drawn_points.items():
-                slides = sorted(counts_and_accuracies)
-                mean, low, high = (
-                    [100 * value for value in part]
-                    for part in zip(*(counts_and_accuracies[at] for at in slides), strict=True)
-                )
+            for name, accuracies in drawn_points.items():
+                slides = sorted(accuracies)
+                mean, low, high = (100 * np.array([accuracies[count] for count in slides])).T
                 lines.append(Curve(name, slides, mean, low, high))
             chance = 100 / max(len(shown_methods[0].details[0].config.get("classes", ())), 1)
             spec = charts.lines(lines, "training slides", "accuracy (%)", level=("chance", chance))
@@ -232,7 +228,7 @@ def latent_folds(methods: Sequence[Method]) -> list[Fold]:
 
 
 def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
-    """Project sets of points (slide, latent) on the first two principal components of all, each (slide, 2).
+    """Return sets of points (slide, latent) projected on the first two principal components of all, each (slide, 2).
 
     The sign of each component makes its largest weight positive.
     """
@@ -266,21 +262,23 @@ def count_nearest_partners(
 
 
 def _latent_chart(method: Method) -> Chart | None:
-    """Return the latents of one run of a method, or of one run per sensor if each has its own model."""
+    """Return a chart of the latents of one run of a method, or of one run per sensor if each has its own model.
+
+    None without latents of two sensors.
+    """
     rows = _paired_predictions(method.details)
     if rows is None:
         return None
     sensors, parts = rows
     points = project_on_plane([_part_latents(part) for part in parts])
-    partners = {
-        int(material): int(partner) for material, partner in method.details[0].config.get("partners", {}).items()
-    }
+    stored_partners = method.details[0].config.get("partners", {})
+    partners = {int(material): int(partner) for material, partner in stored_partners.items()}
     nearest_count, count = count_nearest_partners(parts[0], parts[1], partners)
-    dots: list[charts.DataRow] = [
-        {"name": str(name), "x": float(x), "y": float(y), "shape": sensor_title(sensor), "tip": str(recording)}
-        for sensor, part, at in zip(sensors, parts, points, strict=True)
-        for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, at, strict=True)
-    ]
+    dots: list[charts.DataRow] = []
+    for sensor, part, positions in zip(sensors, parts, points, strict=True):
+        shape = sensor_title(sensor)
+        for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, positions, strict=True):
+            dots.append({"name": str(name), "x": float(x), "y": float(y), "shape": shape, "tip": str(recording)})
     spec = charts.scatter(
         dots,
         "first principal component",
@@ -302,19 +300,22 @@ def _latent_rows(
     The mean for the second sensor is that of the material's partner, if it has a partner.
     """
     means = [
-        {int(material): at[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
-        for at, part in zip(points, parts, strict=True)
+        {int(material): positions[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
+        for positions, part in zip(points, parts, strict=True)
     ]
     names = dict(zip(parts[0].materials.tolist(), parts[0].named(parts[0].materials).tolist(), strict=True))
     return [
-        (str(names[material]), middle, means[1][partners.get(material, material)])
-        for material, middle in means[0].items()
+        (str(names[material]), first_mean, means[1][partners.get(material, material)])
+        for material, first_mean in means[0].items()
         if partners.get(material, material) in means[1]
     ]
 
 
 def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str], list[SlidePredictions]] | None:
-    """Return two sensors and the rows of each, from the first run that contains both or else from the first run of each."""
+    """Return two sensors and the rows of each, from the first run that contains both, else from the first run of each.
+
+    None without latents of two sensors in spaces of equal dimension.
+    """
     with_latents = [run for run in runs if run.predictions.latents is not None]
     sensors = ordered_sensors([sensor for run in with_latents for sensor in run.sensors])[:2]
     if len(sensors) < 2:
@@ -365,10 +366,10 @@ def typical_slide(shards: Sequence[Recording]) -> Recording:
     """Return the slide with the median force among those that followed the protocol, or among all if none did."""
     inside_protocol = [shard for shard in shards if not shard.attributes.get("outside_protocol")] or list(shards)
 
-    def force(shard: Recording) -> tuple[float, str]:
+    def by_force(shard: Recording) -> tuple[float, str]:
         return float(shard.attributes.get("force_n") or 0.0), shard.name
 
-    return sorted(inside_protocol, key=force)[len(inside_protocol) // 2]
+    return sorted(inside_protocol, key=by_force)[len(inside_protocol) // 2]
 
 
 def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:

@@ -68,16 +68,14 @@ NO_CONTROL = (
 
 
 def joint_effects(methods: Sequence[Method]) -> list[str]:
-    """Return sentences on the effect of joint learning and the result of its control."""
+    """Return sentences on the effect of joint learning and the result of its control; empty without a joint method."""
     main = scores.main_method(methods)
-    return (
-        [
-            *_joint_gain(main, scores.independent_method(methods, main)),
-            describe_control(main, scores.permuted_method(methods, main)),
-        ]
-        if main
-        else []
-    )
+    if main is None:
+        return []
+    return [
+        *_joint_gain(main, scores.independent_method(methods, main)),
+        describe_control(main, scores.permuted_method(methods, main)),
+    ]
 
 
 def describe_control(joint: Method, permuted: Method | None) -> str:
@@ -93,11 +91,11 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
         )
     costs = [
         {
-            name: counted.fraction - swaps[at][name].fraction
+            name: counted.fraction - swaps[index][name].fraction
             for name in swaps[0]
             if (counted := accuracy(runs_on(item, name), name))
         }
-        for at, item in enumerate((joint, permuted))
+        for index, item in enumerate((joint, permuted))
     ]
     if max(costs[0].values()) > MAX_SWAP_LOSS:
         return (
@@ -105,8 +103,8 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
             f"{100 * max(costs[0].values()):.1f} points lower than with the sensors' own, so there is nothing to "
             "compare the control with."
         )
-    aligns = alignments[1] <= MAX_DISTANCE_RATIO * alignments[0]
-    works = all(costs[1][sensor] - costs[0][sensor] <= MAX_EXTRA_SWAP_LOSS for sensor in costs[0])
+    aligns_as_well = alignments[1] <= MAX_DISTANCE_RATIO * alignments[0]
+    swaps_as_well = all(costs[1][sensor] - costs[0][sensor] <= MAX_EXTRA_SWAP_LOSS for sensor in costs[0])
     numbers = (
         f"latent difference {number(alignments[1]).text} against {number(alignments[0]).text}; classifiers exchanged: "
         + ", ".join(
@@ -115,14 +113,14 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
             for sensor, with_real_pairs in swaps[0].items()
         )
     )
-    if aligns and works:
+    if aligns_as_well and swaps_as_well:
         return (
             "The alignment is driven by labels: pairs of permuted materials align as well, and exchanged "
             f"classifiers lose about as little accuracy ({numbers}), so neither shows that the sensors have more "
             "in common than labels."
         )
-    half = "align as well but do not swap as well" if aligns else "swap as well but do not align as well"
-    verdict = half if aligns or works else "neither align nor swap as well"
+    half = "align as well but do not swap as well" if aligns_as_well else "swap as well but do not align as well"
+    verdict = half if aligns_as_well or swaps_as_well else "neither align nor swap as well"
     return f"Pairs of permuted materials {verdict} as real ones ({numbers})."
 
 
@@ -144,6 +142,7 @@ def _joint_gain(joint: Method, independent: Method | None) -> list[str]:
 
 
 def _describe_difference(difference: MethodDifference) -> str:
+    """Return the gain of one method over another with its interval and the tests, as text."""
     tests = [f"McNemar p = {p_value(difference.mcnemar).text}"]
     if not math.isnan(difference.runs.p):
         tests.append(
@@ -168,11 +167,13 @@ def _swapped_accuracy(method: Method) -> dict[str, Accuracy]:
 
 def swap_table(methods: Sequence[Method]) -> Table | None:
     """Return Table II, the accuracy before and after exchanging classifiers; None if they were not exchanged."""
-    candidates = [item for item in methods if has_usual_settings(item.settings) or scores.is_control(item)]
+    usual_methods = [item for item in methods if has_usual_settings(item.settings) or scores.is_control(item)]
     candidates = [
-        item for item in candidates if any(SWAPPED in result.predictions.predicted for result in item.details)
+        item
+        for item in usual_methods
+        if not item.settings["frozen_sensor"]
+        and any(SWAPPED in result.predictions.predicted for result in item.details)
     ]
-    candidates = [item for item in candidates if not item.settings["frozen_sensor"]]
     sensors = sensors_of(candidates)
     rows: list[list[str | Cell]] = []
     for method in candidates:
@@ -254,16 +255,13 @@ def reduction_tables(methods: Sequence[Method]) -> list[Table]:
     candidates = [method for method in methods if has_usual_settings(method.settings, "subsample_sensor", "few")]
     if not all(method.published for method in candidates):
         return []
-    reduced_sensors = {
-        str(method.settings[name])
-        for method in candidates
-        if method.family == JOINT
-        for name in ("subsample_sensor", "few_of")
-    }
+    joint_methods = [method for method in candidates if method.family == JOINT]
+    reduced_sensors = {str(m.settings[name]) for m in joint_methods for name in ("subsample_sensor", "few_of")}
     return [_reduction_table(candidates, sensor) for sensor in TABLE_NUMBERS if sensor in reduced_sensors]
 
 
 def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
+    """Return the table of a reduced sensor: accuracies by share of its slides, next to those of the paper."""
     columns = [(JOINT, "biotac"), (JOINT, "roboskin"), (ALONE, reduced)]
     all_slides = max(run.trained.get(reduced, 0) for candidate in methods for run in candidate.details)
     rows = []
@@ -299,13 +297,11 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
 
 
 def _reduction_cell(methods: Sequence[Method], sensor: str) -> str | Cell:
-    """Return the accuracy of the method with the most runs."""
+    """Return the accuracy of the method with the most runs; a dash without methods."""
     method_with_most_runs = max(methods, key=lambda method: len(runs_on(method, sensor)), default=None)
-    return (
-        scores.accuracy_cell(accuracy(runs_on(method_with_most_runs, sensor), sensor))
-        if method_with_most_runs
-        else NONE
-    )
+    if method_with_most_runs is None:
+        return NONE
+    return scores.accuracy_cell(accuracy(runs_on(method_with_most_runs, sensor), sensor))
 
 
 def _has_as_many(method: Method, slides: int, sensor: str) -> bool:
@@ -369,13 +365,16 @@ def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
         if not evaluated or not group.main:
             continue
         chance = group.results[0]["chance"][group.sensor]
-        unsure = "which cannot be distinguished from chance"
-        word = "above chance" if low > chance else "below chance" if high < chance else unsure
+        verdict = "which cannot be distinguished from chance"
+        if low > chance:
+            verdict = "above chance"
+        elif high < chance:
+            verdict = "below chance"
         sentences.append(
             f"Of {sensor_title(group.sensor)} slides of materials that it never learned, the other sensor's classifier "
             f"names {scores.format_percent(correct / evaluated)} % right ({group.kind}, {correct} of {evaluated}; "
             f"95 % interval {scores.format_percent(low)} to {scores.format_percent(high)} %), "
-            f"{word} ({scores.format_percent(chance)} %)."
+            f"{verdict} ({scores.format_percent(chance)} %)."
         )
     return sentences
 
@@ -388,12 +387,10 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
             groups.setdefault(method.key_without("hold_out"), []).append(method)
     scored_methods = []
     for similar_methods in groups.values():
-        runs: list[tuple[ZeroShotAccuracy, Method]] = [
-            (result.metrics["zero_shot"], method)
-            for method in similar_methods
-            for result in method.details
-            if "zero_shot" in result.metrics
-        ]
+        runs: list[tuple[ZeroShotAccuracy, Method]] = []
+        for method in similar_methods:
+            scored = [result.metrics["zero_shot"] for result in method.details if "zero_shot" in result.metrics]
+            runs += [(accuracies, method) for accuracies in scored]
         for sensor in dict.fromkeys(name for tree, _ in runs for name in tree["accuracy"]):
             evaluated = [(tree, method) for tree, method in runs if sensor in tree["accuracy"]]
             first = evaluated[0][1]
@@ -406,7 +403,7 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
 
 
 def _zero_shot_counts(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> tuple[int, int, float, float]:
-    """Return the correct and total number of slides, and the interval of the accuracy.
+    """Return the correct and total number of slides, and the bounds of the accuracy's interval; NaN without slides.
 
     Slides of one material are not independent, even by chance and over several runs. So the number of trials is the
     number of held-out ``materials``.

@@ -97,9 +97,9 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
 
     @property
     def place(self) -> tuple[str, str]:
-        """Split and layout of its slides; results are only pooled if both are equal."""
+        """The split and the layout of its slides, authors or time; results are only pooled if both are equal."""
         layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
-        return str(self.config.get("split", "")), "authors" if "authors" in layouts else "time"
+        return str(self.config.get("split", "")), ("authors" if "authors" in layouts else "time")
 
 
 Method = runs.Method[MaterialResult]
@@ -230,10 +230,10 @@ def _settings(run: MaterialResult) -> Settings:
     joint = bool(config.get("joint", params.get("joint", False)))
     ratio = int(params.get("subsample_percent", 100))
     shortened = run.epochs_of_paper if run.published else ""
-    idle = {*_NO_METHOD, *(["epochs"] if shortened else []), *(() if joint or frozen else _PAIRS)}
+    omitted = {*_NO_METHOD, *(["epochs"] if shortened else []), *(() if joint or frozen else _PAIRS)}
     split, layout = run.place
     return {
-        **{name: value for name, value in params.items() if name not in idle},
+        **{name: value for name, value in params.items() if name not in omitted},
         "architecture": architecture,
         "joint": joint,
         "frozen_sensor": bool(frozen),  # each run reports on the mapped sensor, so both directions are one method
@@ -311,6 +311,7 @@ def correct_by_recording(result: MaterialResult, sensor: str, predictor: str) ->
 
 
 def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
+    """Return the run of a result: per sensor, the numbers of correct slides of each predictor."""
     place = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
     classes = len(result.config.get("classes", ()))
     questions = {}

@@ -72,19 +72,20 @@ def read_predictions(table: pa.Table, config: MaterialConfig) -> SlidePrediction
     copied.
     """
     naming = Naming.from_json(config)
-    table = table.filter(_counted_slides(table, config, naming))
-    names = [name for name in table.column_names if name.startswith("z") and name[1:].isdigit()]
-    latents = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64) if names else None
+    counted = table.filter(_counted_slides(table, config, naming))
+    names = [name for name in counted.column_names if name.startswith("z") and name[1:].isdigit()]
+    latents = np.column_stack([counted[name].to_numpy() for name in names]).astype(np.float64) if names else None
+    sessions = None
+    if "session" in counted.column_names:
+        sessions = np.array([session or "" for session in counted["session"].to_pylist()], dtype=np.str_)
     return SlidePredictions(
-        np.array(table["recording"].to_pylist(), dtype=np.str_),
-        np.array(table["sensor"].to_pylist(), dtype=np.str_),
-        _numbers(table, "material", naming),
-        {name: _numbers(table, name, naming) for name in PREDICTORS if name in table.column_names},
+        np.array(counted["recording"].to_pylist(), dtype=np.str_),
+        np.array(counted["sensor"].to_pylist(), dtype=np.str_),
+        _numbers(counted, "material", naming),
+        {name: _numbers(counted, name, naming) for name in PREDICTORS if name in counted.column_names},
         latents if latents is not None and np.isfinite(latents).all() else None,
         naming,
-        np.array([session or "" for session in table["session"].to_pylist()], dtype=np.str_)
-        if "session" in table.column_names
-        else None,
+        sessions,
     )
 
 

@@ -88,7 +88,7 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
     import pandas as pd
 
     parts = []
-    for number_of, run in enumerate(runs_on(method, sensor)):
+    for index, run in enumerate(runs_on(method, sensor)):
         files = run.details.dataset.files
         if ANSWERS not in files:
             continue
@@ -98,7 +98,7 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
         rows = run.details.predictions.of(sensor)
         truth = dict(zip(rows.recordings.tolist(), map(str, rows.named(rows.materials).tolist()), strict=True))
         is_counted = answers.recording.isin(truth) | ~answers.known  # known materials: slides as elsewhere on the page
-        answers = answers[is_counted].assign(run=number_of, refused=answers.answer == UNKNOWN)
+        answers = answers[is_counted].assign(run=index, refused=answers.answer == UNKNOWN)
         parts.append(answers.assign(right=answers.named == answers.recording.map(truth)))
     return pd.concat(parts) if parts else None
 
@@ -164,8 +164,8 @@ def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float
         for bin_tree in measured["before"]["reliability"] if measured else []:
             bin_index = min(int(bin_tree["confidence"] * calibration.BINS), calibration.BINS - 1)
             total = sums.setdefault(bin_index, [0.0, 0.0, 0.0])
-            for at, value in enumerate((1.0, bin_tree["confidence"], bin_tree["accuracy"])):
-                total[at] += bin_tree["n"] * value
+            for index, value in enumerate((1.0, bin_tree["confidence"], bin_tree["accuracy"])):
+                total[index] += bin_tree["n"] * value
     return [(probability / n, right / n) for _, (n, probability, right) in sorted(sums.items())]
 
 
@@ -195,7 +195,7 @@ def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]])
 
 
 def _table_row(method: Method, sensor: str, answers: pd.DataFrame) -> Sequence[str | Cell]:
-    """Return a row of the table."""
+    """Return the row of a method on a sensor's slides: errors of its probabilities, and rates of the answer unknown."""
     trees = [run.details.metrics for run in runs_on(method, sensor)]
     measured = [tree["calibration"][sensor] for tree in trees if sensor in tree.get("calibration", {})]
     refused = [tree["unknown"][sensor] for tree in trees if sensor in tree.get("unknown", {})]

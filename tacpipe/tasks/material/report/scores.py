@@ -106,7 +106,7 @@ def compare_runs(
 
     For McNemar's test a slide is correct if at least half of a method's runs classify it correctly.
     """
-    runs_by_method = [runs_on(first_right, sensor) for first_right in (first, second)]
+    runs_by_method = [runs_on(method, sensor) for method in (first, second)]
     if not all(runs_by_method) or (question := question_on(runs_by_method[0][0], sensor)) is None:
         return None
     gain = engine.difference(first, second, question, predictors)
@@ -158,7 +158,7 @@ def main_method(methods: Sequence[Method], family: str = "RAEC joint") -> Method
 
 
 def independent_method(methods: Sequence[Method], joint: Method) -> Method | None:
-    """Return the network that was trained on one sensor only and is most similar to a joint one."""
+    """Return the network that was trained on one sensor only and is most similar to a joint one, or None."""
     return nearest_method(
         joint,
         [method for method in methods if has_usual_settings(method.settings) and method.family == "RAEC independent"],
@@ -171,7 +171,10 @@ def permuted_method(methods: Sequence[Method], joint: Method) -> Method | None:
 
 
 def nearest_method(method: Method, candidates: Sequence[Method]) -> Method | None:
-    """Return the candidate that shares the most settings with a method; ties are resolved by number of runs."""
+    """Return the candidate that shares the most settings with a method, or None without candidates.
+
+    Ties are resolved by number of runs, then by name.
+    """
 
     def shared(candidate: Method) -> int:
         return sum(candidate.settings.get(name) == value for name, value in method.settings.items())
@@ -194,7 +197,7 @@ def caution(methods: Sequence[Method]) -> str:
 
 
 def format_percent(fraction: float) -> str:
-    """Format a fraction in percent.
+    """Return a fraction in percent with one decimal, "–" for NaN.
 
     >>> format_percent(0.995), format_percent(float("nan"))
     ('99.5', '–')

@@ -51,7 +51,7 @@ def requested_cloud(record: Any, folder: str, previous: Cloud | None) -> Cloud:
             raise TacpipeError("The request has no cloud, and no request before had one.")
         return previous
     if isinstance(points_or_file, str):
-        return _file(points_or_file, folder)
+        return _read_file(points_or_file, folder)
     points = np.array(points_or_file, np.float64)
     if points.shape[1] == len("xyz"):
         return Cloud(points.astype(np.float32))
@@ -61,7 +61,8 @@ def requested_cloud(record: Any, folder: str, previous: Cloud | None) -> Cloud:
     return Cloud(points[:, :3].astype(np.float32), np.rint(colours).astype(np.uint8))
 
 
-def _file(name: str, folder: str) -> Cloud:
+def _read_file(name: str, folder: str) -> Cloud:
+    """Return the cloud in a file of the ``folder``. Raises `TacpipeError` if it is outside, or no cloud."""
     if not folder:
         raise TacpipeError(
             f"The request names the file {excerpt(name)}, but files are read only from the folder in the option folder "
@@ -71,10 +72,11 @@ def _file(name: str, folder: str) -> Cloud:
     path = (inside / name).resolve()
     if not path.is_relative_to(inside):
         raise TacpipeError(f"The file {excerpt(name)} is not within {inside}.")
-    return _npz(path) if path.suffix.lower() == NPZ else files.read(path)
+    return _read_npz(path) if path.suffix.lower() == NPZ else files.read(path)
 
 
-def _npz(path: Path) -> Cloud:
+def _read_npz(path: Path) -> Cloud:
+    """Return the cloud in an NPZ file. Raises `TacpipeError` if it is too large, invalid or not in metres."""
     try:
         if path.stat().st_size > MAX_NPZ_BYTES:
             raise TacpipeError(f"{path} is larger than {MAX_NPZ_BYTES >> 20} MiB.")
@@ -199,7 +201,7 @@ class TouchEngine(Engine):
         self._recorded_streams.add(stream)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
-        """Queue the requests of a stream; beyond `WAITING`, the oldest are dropped."""
+        """Queue the requests in chunks of a stream; beyond `WAITING`, the oldest are dropped and counted."""
         if stream not in self.requests or stream not in self._recorded_streams or not self.running:
             return
         runs, _ = self._framers[stream].feed(chunks)
@@ -214,13 +216,14 @@ class TouchEngine(Engine):
         return now_ns if self._waiting else now_ns + IDLE_NS
 
     def step(self, now_ns: int) -> list[TouchMessage]:
-        """Return the response to the oldest queued request."""
+        """Return the response to the oldest queued request, or nothing if there is none."""
         if not self._waiting or self._offset_ns is None:
             return []
         t_ns, stream, text = self._waiting.popleft()
-        return [self._predict_message(t_ns + self._offset_ns, stream, parse_request(text))]
+        return [self._answer_request(t_ns + self._offset_ns, stream, parse_request(text))]
 
-    def _predict_message(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
+    def _answer_request(self, t_ns: int, stream: str, record: Any) -> TouchMessage:
+        """Return the ranking of a request that arrived at ``t_ns``, or why there is none."""
         began_s = time.perf_counter()
         header = (self.next_seq(), t_ns, int(record["request"]), self._criterion.text)
         try:

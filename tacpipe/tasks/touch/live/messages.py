@@ -128,6 +128,7 @@ class TouchMessage(messages.Message):
         return None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))]
 
     def _candidate(self, row: int) -> CandidateJson:
+        """Return the JSON value of a candidate with its rank, score and predicted touch."""
         assert self.touch is not None
         values = [None if math.isnan(value) else value for value in self.touch[row].astype(np.float32).tolist()]
         thumb, middle = map(rounded, self.levels[row].tolist())

@@ -48,7 +48,7 @@ class TouchReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return R², skill over the constant, mean absolute error and batch means."""
+        """Return R², skill over the constant, RMSE over runs, batch mean and MAE: heads and functions of a row."""
         target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
         known_objects = comparison.question.part.startswith(headlines.PARTS[True])
 
@@ -74,7 +74,7 @@ class TouchReport(TaskReport):
         ]
 
     def sentence(self, context: Context) -> tuple[str, str]:
-        """Return the general sentence, and whether any method is better than the baselines on novel objects."""
+        """Return the general sentence, with a note if no method is better on novel objects, and the verdict."""
         text, verdict = screen.sentence(context)
         novel = [comparison for comparison in context.comparisons if comparison.question.part.startswith("novel")]
         better = [
@@ -85,7 +85,7 @@ class TouchReport(TaskReport):
         return text, verdict
 
     def folds(self, context: Context) -> list[Fold]:
-        """Return the sections that are specific to touch."""
+        """Return the folds that are specific to touch."""
         methods = context.methods
         if not methods:
             return figures.cloud_folds(context.others, {})
@@ -126,17 +126,15 @@ class TouchReport(TaskReport):
         ]
 
     def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return additional columns of the table of runs."""
+        """Return further columns of the table of runs: split, training grasps, epochs, and R² by target."""
         trained = run.details.trained
         rsquared = []
         for known_objects in (True, False):
             for target in run.details.predictions.targets:
                 result = predictions.score([run.details.predictions], target, known_objects)
-                rsquared += (
-                    [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(result.r2, 2)}"]
-                    if result
-                    else []
-                )
+                if result:
+                    name = f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}"
+                    rsquared.append(f"{name}: {blocks.fixed(result.r2, 2)}")
         return {
             "split": methods.split_name(run.details.split),
             "trained on": NONE if trained is None else f"{trained:,}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,9 +49,10 @@ def pressure_folds(method: Method) -> list[Fold]:
 
 
 def _pressure_chart(method: Method, target: str) -> Chart:
-    rows = method.details[0].predictions
-    total = len(rows.recordings)
-    rows = rows.rows(np.unique(np.linspace(0, total - 1, MAX_GRASPS).astype(int)))
+    """Return a chart of predicted against true pressures of a target, for some grasps of the first run."""
+    all_rows = method.details[0].predictions
+    total = len(all_rows.recordings)
+    rows = all_rows.rows(np.unique(np.linspace(0, total - 1, MAX_GRASPS).astype(int)))
     values = rows.true[target][:, 0], rows.predicted[MODEL][target][:, 0]
     dots: list[charts.DataRow] = [
         {
@@ -224,6 +226,10 @@ def _has_grasp(shard: Recording) -> bool:
 
 
 def _cloud_chart(shard: Recording, words: str) -> Chart:
+    """Return a chart of a cloud from two views, with the points near both contacts highlighted.
+
+    ``words`` describe the grasp.
+    """
     cloud, grasp = Cloud.from_table(shard.table(CLOUD)), Grasp.from_table(shard.table(GRASP))
     contacts_m = np.array([grasp.g1_m, grasp.g2_m])
     middle = contacts_m.mean(axis=0)
@@ -232,21 +238,14 @@ def _cloud_chart(shard: Recording, words: str) -> Chart:
     contacts = 1000 * (contacts_m - middle)
     distance = np.linalg.norm(points[:, None] - contacts[None], axis=2)  # (point, finger)
     near = np.where(distance.min(axis=1) <= NEAR_MM, np.array([1, -1])[distance.argmin(axis=1)], 0)
-    rows: list[charts.DataRow] = [
-        {
-            "panel": view,
-            "x": float(round(point[across], 1)),
-            "y": float(round(-point[1], 1)),
-            "strength": 0.6 * int(side),
-        }
-        for view, across in VIEWS.items()
-        for point, side in zip(points, near, strict=True)
-    ]
-    rows += [
-        {"panel": view, "x": float(point[across]), "y": float(-point[1]), "strength": side}
-        for view, across in VIEWS.items()
-        for point, side in zip(contacts, (1.0, -1.0), strict=True)
-    ]
+    rows: list[charts.DataRow] = []
+    for view, across in VIEWS.items():
+        for point, side in zip(points, near, strict=True):
+            x, y = float(round(point[across], 1)), float(round(-point[1], 1))
+            rows.append({"panel": view, "x": x, "y": y, "strength": 0.6 * int(side)})
+    for view, across in VIEWS.items():
+        for point, strength in zip(contacts, (1.0, -1.0), strict=True):
+            rows.append({"panel": view, "x": float(point[across]), "y": float(-point[1]), "strength": strength})
     about = f"{shard.name}{f' ({words})' if words else ''}: {shard.attributes.get('object', 'an object')}"
     caption = f"{len(cloud):,} points, the fingers {1000 * grasp.opening_m:.0f} mm apart."
     return Chart(about, charts.plane(rows, list(VIEWS), size=9), caption)
@@ -275,11 +274,11 @@ def loss_charts(methods: Sequence[Method]) -> list[Chart]:
 
 def figure_8(methods: Sequence[Method]) -> list[Chart]:
     """Return Figure 8 of the paper: both losses of its network with the most epochs; empty if it was not run."""
+    paper_methods = [method for method in methods if method.settings["architecture"] == PAPER]
     candidates = [
         (method, target)
-        for method in methods
-        for target in (paper.TARGET, ALL)
-        if method.settings["architecture"] == PAPER and _loss_curves(method, target, "train_loss")
+        for method, target in itertools.product(paper_methods, (paper.TARGET, ALL))
+        if _loss_curves(method, target, "train_loss")
     ]
     if not candidates:
         return []

@@ -148,7 +148,7 @@ def default_method(methods: Sequence[Method]) -> Method:
 def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
     """Return one method per architecture: most runs, then one that reads colour, then the shortest name."""
 
-    def sort_key(method: Method) -> tuple[int, bool, int, str]:
+    def preference(method: Method) -> tuple[int, bool, int, str]:
         return (
             -len(method.runs),
             not method.settings.get("colour", True),
@@ -157,7 +157,7 @@ def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
         )
 
     by_architecture: dict[str, Method] = {}
-    for candidate in sorted(methods, key=sort_key):
+    for candidate in sorted(methods, key=preference):
         by_architecture.setdefault(str(candidate.settings["architecture"]), candidate)
     return sorted(by_architecture.values(), key=lambda candidate: candidate.name)
 
@@ -213,11 +213,9 @@ def caution(methods: Sequence[Method]) -> str:
         return context.SIMULATED
     counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]
     follow_same, follow_any = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
-    return (
-        RECORDED.format(same=f"{follow_same:,}", all=f"{follow_any:,}")
-        if follow_any and follow_same / follow_any >= MAX_IN_A_ROW
-        else ""
-    )
+    if not follow_any or follow_same / follow_any < MAX_IN_A_ROW:
+        return ""
+    return RECORDED.format(same=f"{follow_same:,}", all=f"{follow_any:,}")
 
 
 def baseline_name(predictor: str) -> str:
@@ -299,6 +297,7 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
 
 
 def _run(run: TouchResult, name: str, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
+    """Return the run of a result: per target, the squared errors of each predictor on known and on novel objects."""
     questions = {}
     for known_objects in (True, False):
         rows = run.predictions.of(known_objects)

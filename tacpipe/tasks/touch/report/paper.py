@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -108,11 +109,13 @@ def score_cells(result: Score | None) -> list[str | Cell]:
 
 
 def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | None) -> list[tuple[str, Score | None]]:
-    """Return the mandatory baselines and any others in the methods' results: table name and score."""
+    """Return the table name and score of the mandatory baselines and any others in the methods' results.
+
+    The score is None without predictions of the target.
+    """
     runs_by_method = {method.name: predictions_of_runs(method) for method in methods}
-    other_predictors = {
-        name for runs in runs_by_method.values() for run in runs for name in run.predicted if name != MODEL
-    }
+    all_runs = [run for runs in runs_by_method.values() for run in runs]
+    other_predictors = {name for run in all_runs for name in run.predicted} - {MODEL}
     rows = []
     for predictor in dict.fromkeys([*BASELINES, *sorted(other_predictors)]):
         holding = [
@@ -129,6 +132,7 @@ def predictions_of_runs(method: Method) -> list[GraspPredictions]:
 
 
 def _table_by_object(method: Method) -> Table | None:
+    """Return a method's errors by object, with those of the object's mean, or None without unseen grasps."""
     predicted, runs = predicted_targets(method), predictions_of_runs(method)
     rows: list[list[str | Cell]] = []
     kinds: dict[int, str] = {}
@@ -257,10 +261,10 @@ def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Meth
         if method.settings["architecture"] == PAPER and value in form.names and score_on_target(method):
             families.setdefault(method.key_without(form.setting, *form.also), {}).setdefault(value, method)
 
-    def place(by_value: Mapping[object, Method]) -> tuple[int, int]:
+    def size(by_value: Mapping[object, Method]) -> tuple[int, int]:
         return len(by_value), sum(len(method.runs) for method in by_value.values())
 
-    return max(families.values(), key=place, default={})
+    return max(families.values(), key=size, default={})
 
 
 def score_on_target(method: Method) -> Score | None:
@@ -269,6 +273,7 @@ def score_on_target(method: Method) -> Score | None:
 
 
 def _setting_table(form: Form, methods: Sequence[Method]) -> list[Block]:
+    """Return the table of a setting of the paper's network, with a chart and notes; empty for fewer than two values."""
     by_value = methods_by_value(methods, form)
     if len(by_value) < 2:
         return []
@@ -307,16 +312,14 @@ def _printed_setting(form: Form, value: object) -> list[str | Cell]:
 
 
 def _setting_chart(form: Form, scores: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> Chart:
-    dots = [
-        Dot(name, scored.each.mean, scored.each.mean - sd, scored.each.mean + sd, kind)
-        for scores_by_name, kind in (
-            ({form.names[value]: scored for value, scored in scores.items()}, "model"),
-            (baselines, "baseline"),
-        )
-        for name, scored in scores_by_name.items()
-        if scored
-        for sd in [0.0 if math.isnan(scored.each.sd) else scored.each.sd]
-    ]
+    """Return a chart of the errors by value of a setting, next to those of the baselines."""
+    named_scores = [(form.names[value], scored, "model") for value, scored in scores.items()]
+    named_scores += [(name, scored, "baseline") for name, scored in baselines.items()]
+    dots = []
+    for name, scored, kind in named_scores:
+        if scored:
+            mean, sd = scored.each.mean, 0.0 if math.isnan(scored.each.sd) else scored.each.sd
+            dots.append(Dot(name, mean, mean - sd, mean + sd, kind))
     caption = "Mean and standard deviation over runs; grey: baselines on the same grasps."
     return Chart("Error by inputs of the network", charts.ranking(dots, "RMSE (fraction of the range)"), caption)
 
@@ -339,14 +342,13 @@ def _pairs(methods: Sequence[Method]) -> list[tuple[Method, Method]]:
 
     For novel objects the paper trains a new network on all grasps of known objects.
     """
-    known_methods, novel = (
-        [first for first in methods if len(_scored_targets(first, known_objects)) > 1]
+    known_methods, novel_methods = (
+        [method for method in methods if len(_scored_targets(method, known_objects)) > 1]
         for known_objects in (True, False)
     )
     return [
         (first, second)
-        for first in known_methods
-        for second in novel
+        for first, second in itertools.product(known_methods, novel_methods)
         if first.key_without("split") == second.key_without("split")
     ]
 
@@ -359,6 +361,7 @@ def _pair_order(pair: tuple[Method, Method]) -> tuple[int, int, bool]:
 
 
 def _scored_targets(method: Method, known_objects: bool) -> list[str]:
+    """Return the targets that a method predicted for known or for novel objects."""
     return [
         target
         for target in predicted_targets(method)
@@ -367,6 +370,7 @@ def _scored_targets(method: Method, known_objects: bool) -> list[str]:
 
 
 def _generalisation_table(known_method: Method, novel: Method) -> list[Block]:
+    """Return the table of methods' errors on known and on novel objects, next to the baselines' and the paper's."""
     published = known_method.published and novel.published
     rows: list[list[str | Cell]] = []
     pairs: list[tuple[Score | None, Score | None]] = []
@@ -421,6 +425,7 @@ def _part_cells(result: Score | None) -> list[str | Cell]:
 
 
 def _printed_target(target: str) -> list[str | Cell]:
+    """Return the cells of the paper's errors on a target: test, novel, and the change."""
     paper_errors = TEST_AND_NOVEL[target]
     pairs = ((paper_errors.test, paper_errors.test_counts), (paper_errors.novel, paper_errors.novel_counts))
     return [

@@ -40,7 +40,10 @@ class GraspPredictions:
 
     @property
     def in_a_row(self) -> tuple[int, int]:
-        """Number of grasps that follow one of the same object in time order, and number that follow any grasp."""
+        """The number of grasps that follow one of the same object in time order, and the number that follow any grasp.
+
+        Both are 0 if times are unknown, or there are fewer than two grasps or objects.
+        """
         if self.t_ns is None or len(self.t_ns) < 2 or len(set(self.objects.tolist())) < 2:
             return 0, 0
         objects = self.objects[np.argsort(self.t_ns, kind="stable")]
@@ -115,7 +118,7 @@ class Score:
 
 
 def to_counts(target: str, fraction: float) -> float:
-    """Convert a fraction of a target's range to device counts.
+    """Return a fraction of a target's range in device counts.
 
     >>> to_counts("pdc_th", 0.1)
     90.0
