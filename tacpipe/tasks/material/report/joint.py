@@ -261,7 +261,7 @@ def reduction_tables(methods: Sequence[Method]) -> list[Table]:
 
 
 def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
-    """Return the table of a reduced sensor: accuracies by share of its slides, next to those of the paper."""
+    """Return the table of a reduced sensor: accuracies by fraction of its slides, next to those of the paper."""
     columns = [(JOINT, "biotac"), (JOINT, "roboskin"), (ALONE, reduced)]
     all_slides = max(run.trained.get(reduced, 0) for candidate in methods for run in candidate.details)
     rows = []
