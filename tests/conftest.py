@@ -1,6 +1,7 @@
 """A lab for tests: a project folder with its own store, the command line at hand, and a third party's plug-in."""
 
 import fcntl
+import functools
 import gc
 import json
 import os
@@ -134,18 +135,24 @@ _traced: list[FileCalls] = []
 @pytest.fixture
 def file_calls() -> Iterator[FileCalls]:
     """The calls of this process to open and rename files during the test."""
-    if not _traced:
-        sys.addaudithook(_trace)
-    _traced[:] = [FileCalls()]
-    yield _traced[0]
-    _traced[:] = [FileCalls()]
+    _install_trace()
+    calls = FileCalls()
+    _traced.append(calls)
+    yield calls
+    _traced.remove(calls)
+
+
+@functools.cache
+def _install_trace() -> None:
+    sys.addaudithook(_trace)  # it cannot be removed
 
 
 def _trace(event: str, arguments: Sequence[Any]) -> None:
-    if event == "open" and isinstance(arguments[0], str) and not arguments[2] & (os.O_WRONLY | os.O_RDWR):
-        _traced[0].opened.append(arguments[0])
-    elif event == "os.rename":
-        _traced[0].named.append(os.fspath(arguments[1]))
+    for calls in _traced:
+        if event == "open" and isinstance(arguments[0], str) and not arguments[2] & (os.O_WRONLY | os.O_RDWR):
+            calls.opened.append(arguments[0])
+        elif event == "os.rename":
+            calls.named.append(os.fspath(arguments[1]))
 
 
 @pytest.fixture
