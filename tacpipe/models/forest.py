@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FEATURES = 0.4  # fraction of all features that is tried at a split
 LEAF = -1  # the child of a node without children
@@ -93,6 +95,8 @@ class Forest:
         """Return the arrays that `from_tensors` reads."""
         arrays: dict[str, AnyArray] = {"roots": self.roots, "children": self.children, "features": self.features}
         arrays |= {"cuts": self.cuts, "values": self.values}
+        import torch
+
         return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
     def validate(self, features: int, values: int) -> None:
@@ -102,25 +106,32 @@ class Forest:
         loop.
         """
         nodes = len(self.values)
-        numbers = np.arange(nodes)[:, None]
-        is_valid_child = (self.children > numbers) & (self.children < nodes) | (self.children == LEAF)
-        checks = {
-            "roots": self.roots.ndim == 1 and len(self.roots) > 0,
-            "children": self.children.shape == (nodes, 2) and bool(is_valid_child.all()),
-            "features": self.features.shape == (nodes,)
-            and bool(((self.features >= 0) & (self.features < features)).all()),
-            "cuts": self.cuts.shape == (nodes,),
-            "values": self.values.shape == (nodes, values),
-        }
-        are_integers = all(array.dtype.kind == "i" for array in (self.roots, self.children, self.features))
-        invalid = next(
-            (name for name, is_valid in checks.items() if not is_valid), "" if are_integers else "numbers of nodes"
-        )
-        if invalid or not ((self.roots >= 0) & (self.roots < nodes)).all():
-            raise ValueError(f"the {invalid or 'roots'} of a forest of {nodes} nodes are out of range")
+        checks = node_checks(self.roots, self.children, self.features, self.cuts, nodes, features)
+        checks |= {"roots": checks["roots"] and len(self.roots) > 0, "values": self.values.shape == (nodes, values)}
+        if invalid := next((name for name, is_valid in checks.items() if not is_valid), ""):
+            raise ValueError(f"the {invalid} of a forest of {nodes} nodes are out of range")
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Forest:
         """Return the forest that `to_tensors` stored."""
         names: Sequence[str] = ("roots", "children", "features", "cuts", "values")
         return cls(*(tensors[name].numpy() for name in names))
+
+
+def node_checks(
+    roots: Int32s, children: Int32s, features: Int32s, cuts: Floats, nodes: int, feature_count: int
+) -> dict[str, bool]:
+    """Return whether arrays of ``nodes`` nodes, by name, are trees that read at most ``feature_count`` features.
+
+    Children of a grown tree come after their parent, so no path leads back, and a node has two children or none.
+    """
+    numbers, is_leaf = np.arange(nodes)[:, None], children == LEAF
+    return {
+        "roots": roots.ndim == 1 and bool(((roots >= 0) & (roots < nodes)).all()),
+        "children": children.shape == (nodes, 2)
+        and bool(((children > numbers) & (children < nodes) | is_leaf).all())
+        and bool((is_leaf.sum(axis=1) != 1).all()),
+        "features": features.shape == (nodes,) and bool(((features >= 0) & (features < feature_count)).all()),
+        "cuts": cuts.shape == (nodes,),
+        "numbers of nodes": all(array.dtype.kind == "i" for array in (roots, children, features)),
+    }

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Int32s
+from tacpipe.models.forest import LEAF, node_checks
 
-LEAF = -1  # the child of a node without children
 BINS = 255  # bins of a feature
 SAMPLED_ROWS = 200_000  # rows above which scikit-learn bins a sample of them, without weights
 
@@ -116,24 +116,13 @@ class BoostedTrees:
         """
         trees = cls(**{field.name: arrays[field.name] for field in fields(cls)})
         nodes = len(trees.values)
-        numbers = np.arange(nodes)[:, None]
-        checks = {
-            "roots": trees.roots.ndim == 1 and bool(((trees.roots >= 0) & (trees.roots < nodes)).all()),
-            # a child is behind its parent, so that no way down leads back
-            "children": trees.children.shape == (nodes, 2)
-            and bool((((trees.children > numbers) & (trees.children < nodes)) | (trees.children == LEAF)).all())
-            and bool(((trees.children == LEAF).sum(axis=1) != 1).all()),
-            "features": trees.features.shape == (nodes,)
-            and bool(((trees.features >= 0) & (trees.features < features)).all()),
-            "cuts": trees.cuts.shape == (nodes,) and trees.missing_left.shape == (nodes,),
+        checks = node_checks(trees.roots, trees.children, trees.features, trees.cuts, nodes, features)
+        checks |= {
+            "missing_left": trees.missing_left.shape == (nodes,) and trees.missing_left.dtype.kind == "i",
             "base": trees.base.shape == (1,),
-            "integers": all(
-                part.dtype.kind == "i" for part in (trees.roots, trees.children, trees.features, trees.missing_left)
-            ),
         }
-        wrong = next((name for name, fine in checks.items() if not fine), "")
-        if wrong:
-            raise ValueError(f"the {wrong} of boosted trees of {nodes} nodes are out of range")
+        if invalid := next((name for name, is_valid in checks.items() if not is_valid), ""):
+            raise ValueError(f"the {invalid} of boosted trees of {nodes} nodes are out of range")
         return trees
 
 
