@@ -5,11 +5,11 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
 
-from tacpipe.cli import stage_processes
 from tests.conftest import Lab, tacpipe
 from tests.test_run import STAGES, content, stage_that_adds, write_chain
 
@@ -88,7 +88,7 @@ def test_the_commands_of_a_stage_follow_each_other_and_what_they_print_is_printe
 def test_with_nothing_to_do_no_process_is_started(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     write_chain(STAGES)
     lab.run("run dvc.yaml")
-    monkeypatch.setattr(stage_processes.StageProcesses, "start", lambda *_: pytest.fail("a process was started"))
+    monkeypatch.setattr(BaseProcess, "start", lambda _: pytest.fail("a process was started"))
 
     assert lab.run("run dvc.yaml --jobs 0").err.splitlines()[-1] == "3 unchanged"
 

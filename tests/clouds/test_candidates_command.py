@@ -13,7 +13,6 @@ import numpy as np
 import open3d
 import pytest
 
-import tacpipe
 from tacpipe.cli import candidates as candidates_command
 from tacpipe.clouds.candidates import candidates
 from tacpipe.clouds.cloud import Cloud
@@ -145,9 +144,7 @@ def test_a_mistake_is_a_sentence(lab: Lab, bottle: Cloud, words: str, sentence: 
     assert [path.name for path in Path().iterdir() if path.name.startswith("grasps")] == []
 
 
-def test_a_model_of_another_task_is_refused(lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = {"config.json": json.dumps({"task": "material"}).encode()}
-    monkeypatch.setattr(tacpipe, "open", lambda path: SimpleNamespace(files=files))
-    refused = lab.call("candidates bottle.ply --model models/material")
+def test_a_model_of_another_task_is_refused(lab: Lab, bottle: Cloud, chained: Path) -> None:
+    refused = lab.call(f"candidates bottle.ply --model {chained}/models/forward")
     assert refused.code == 2
-    assert "models/material is a model of task material" in refused.err
+    assert "models/forward is a model of task forward" in refused.err
