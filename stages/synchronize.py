@@ -10,9 +10,10 @@ Example: tacpipe synchronize data/recordings -o data/synced
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from itertools import chain
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
@@ -23,13 +24,11 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Int64s, Times
     from tacpipe.datasets.dataset import Recording
-    from tacpipe.synchronization.streams import TimedStream
 
 
-IN_MEMORY = 1 << 25  # maximum bytes of finished columns in memory; further columns are stored in a temporary file
-BATCH_ROWS = 1 << 15  # rows per batch of a long table
+IN_MEMORY = 1 << 25  # maximum bytes of times in memory; further times are stored in a temporary file
+BLOCK_BYTES = 1 << 25  # approximate size of the samples and rows that are in memory at once
 Timeline = Literal["uniform", "logged", "fresh"]
 
 
@@ -89,95 +88,75 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     text, and those of a single row, cannot be resampled and stay in the recordings. Attributes contain how far rows
     look ahead: the time in ms from a row to the arrival of the latest sample used for it.
     """
-    import numpy as np
     import pyarrow as pa
 
+    from tacpipe.arrays import to_arrow
     from tacpipe.channels import streams as masks
-    from tacpipe.io.columns import release
     from tacpipe.io.spill import MappedArrays
     from tacpipe.signals.repairs import mean_rate_hz, new_frame_rate_hz
-    from tacpipe.signals.resampling import default_gap_ns
+    from tacpipe.signals.resampling import default_gap_ns, median_step_ns
     from tacpipe.synchronization import streams
-    from tacpipe.synchronization import streams as grids
-    from tacpipe.synchronization.columns import look_ahead_ns
-    from tacpipe.synchronization.streams import join_names
+    from tacpipe.synchronization.columns import GridColumns, grid_ranges
 
     recorded_streams = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     signal_streams = {
         name: columns for name, columns in recorded_streams.items() if streams.is_signal(columns)
     } or recorded_streams
     hold_values = params.values == "hold"
+    clock = "arrival" if hold_values else params.clock
     storage = MappedArrays(IN_MEMORY)
-    placed: dict[str, TimedStream] = {}
-    for name, stored in signal_streams.items():
-        placed[name] = streams.to_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
-        stored.forget()
+    placed = {
+        name: streams.to_host_clock(recording.name, name, columns, clock, storage)
+        for name, columns in signal_streams.items()
+    }
     master_name = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in signal_streams.items()}
-    master = placed[grids.master(recording.name, master_name, schemas)]
-    grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, hold_values=hold_values)
-    columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
+    master = placed[streams.master(recording.name, master_name, schemas)]
+    grid_ns, rows = streams.grid(
+        recording.name, params.timeline, params.rate_hz, placed, master, storage, hold_values=hold_values
+    )
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if omitted := [name for name in recorded_streams if name not in signal_streams]:
-        attributes["not_synchronized"] = join_names(omitted)
+        attributes["not_synchronized"] = streams.join_names(omitted)
     attributes["grid_rate_hz"] = round(mean_rate_hz(grid_ns), 3) if params.rate_hz is None else params.rate_hz
     if len(grid_ns) > 1:
-        attributes["step_ms"] = round(float(np.median(np.diff(grid_ns))) / 1e6, 3)
-    ahead_ns = np.zeros(len(grid_ns), np.int64)  # (grid,)
-    for name in list(placed):
-        stream = placed.pop(name)
-        exact = None if hold_values else grids.rows_at(stream.t_ns, grid_ns, rows)
+        attributes["step_ms"] = round(median_step_ns(grid_ns) / 1e6, 3)
+    ahead_ns = storage.empty((0 if hold_values else len(grid_ns),), grid_ns.dtype)  # (grid,)
+    ahead_ns[:] = 0
+    gaps: dict[str, pa.Array] = {}  # masks (grid,) by name
+    readers: list[GridColumns] = []
+    for name, stream in placed.items():
+        exact = None if hold_values else streams.rows_at(stream.t_ns, grid_ns, rows, storage)
         if params.unwrap:
-            stream, wrapped = streams.unwrap_counts(stream, storage.put_aside)
-            attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
+            stream = streams.unwrap_counts(stream)
+            attributes |= {f"{name}_wrapped_channels": len(stream.wraps)} if stream.wraps else {}
         gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
-        columns += _stream_on_grid(params, stream, grid_ns, exact, gap_ns, storage.put_aside)
+        readers.append(GridColumns(stream, grid_ns, exact, gap_ns, storage, hold_values=hold_values))
         if not stream.truth:
+            gaps[name + masks.GAP] = to_arrow(readers[-1].gaps())
             if not hold_values:
-                ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
+                readers[-1].extend_look_ahead(ahead_ns)
             attributes[f"{name}{masks.GAP_MS}"] = gap_ns / 1e6
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
             attributes[f"{name}_fresh_hz"] = round(new_frame_rate_hz(stream.t_ns, stream.repeated), 3)
             attributes |= stream.attributes
-        stream.columns.forget()
-        if not storage.in_memory:
-            release()
-    attributes[masks.LOOK_AHEAD_MEAN] = round(float(ahead_ns.mean()) / 1e6, 3)
-    attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max()) / 1e6, 3)
-    schema = pa.schema([kind for kind, _ in columns])
+        storage.release()
+    attributes[masks.LOOK_AHEAD_MEAN] = round(float(ahead_ns.mean()) / 1e6, 3) if len(ahead_ns) else 0.0
+    attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max(initial=0)) / 1e6, 3)
+    times = master.columns.schema.field("t_ns")
 
-    def table(rows: slice) -> pa.Table:
-        return pa.Table.from_arrays([_column(values[rows], kind.type) for kind, values in columns], schema=schema)
+    def batches(ranges: Sequence[slice]) -> Iterator[pa.RecordBatch]:
+        for points in ranges:
+            columns = [(times, grid_ns[points]), *(column for reader in readers for column in reader.read(points))]
+            arrays = [to_arrow(values, kind.type) if hasattr(values, "dtype") else values for kind, values in columns]
+            yield pa.RecordBatch.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
+            storage.release()
 
-    def batches() -> Iterator[pa.RecordBatch]:
-        for first in range(0, len(grid_ns), BATCH_ROWS):
-            yield from (batch := table(slice(first, first + BATCH_ROWS))).to_batches()
-            storage.read(batch.nbytes)
-
-    gaps = pa.Table.from_pydict(
-        {kind.name: _column(values, kind.type) for kind, values in columns if kind.name.endswith(masks.GAP)}
-    )
-    result = table(slice(None)) if storage.in_memory else pa.RecordBatchReader.from_batches(schema, batches())
-    return RecordingOutput(result, attributes, masks.describe_gaps(gaps))
-
-
-def _column(values: AnyArray | pa.Array, kind: pa.DataType) -> pa.Array:
-    """Return values that are an array of numpy or of pyarrow as a column of type ``kind``."""
-    from tacpipe.arrays import to_arrow
-
-    return to_arrow(values, kind) if hasattr(values, "dtype") else values
-
-
-def _stream_on_grid(
-    params: Params, stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
-) -> list[tuple[pa.Field, Any]]:
-    """Return fields and values of a stream's channels on the grid, and of its masks; ground truth has no masks."""
-    from tacpipe.synchronization import columns
-
-    if params.values == "hold":
-        channels = columns.online_channels(stream, grid_ns, keep)
-        masks = [] if stream.truth else columns.online_masks(stream, grid_ns, gap_ns)
-    else:
-        channels = columns.channels(stream, grid_ns, exact, keep)
-        masks = [] if stream.truth else columns.masks(stream, grid_ns, exact, gap_ns)
-    return channels + [(field, keep(values)) for field, values in masks]
+    storage.release()
+    ranges = list(grid_ranges(grid_ns, list(placed.values()), BLOCK_BYTES))
+    following = batches(ranges)
+    first = next(following)
+    result = pa.Table.from_batches([first])
+    if len(ranges) > 1:
+        result = pa.RecordBatchReader.from_batches(first.schema, chain([first], following))
+    return RecordingOutput(result, attributes, masks.describe_gaps(pa.Table.from_pydict(gaps)))

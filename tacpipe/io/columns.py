@@ -49,6 +49,11 @@ class Columns:
         return self._file.num_rows
 
     @property
+    def row_bytes(self) -> int:
+        """The approximate decoded size of a row in bytes."""
+        return sum(_needed_bytes(field.type, self._block_bytes) for field in self.schema)
+
+    @property
     def column_names(self) -> list[str]:
         """The names of the columns in order."""
         return list(self.schema.names)
@@ -88,6 +93,27 @@ class Columns:
         """Free the cached columns, unless they are those of a small stream."""
         if self._decoded.num_columns < len(self._blocks):
             self._decoded, self._places = pa.table({}), {}
+
+
+class RowRanges:
+    """Decodes ranges of a stream's rows that move forward and may overlap; each row is decoded once."""
+
+    def __init__(self, columns: Columns) -> None:
+        self._batches = columns.batches()
+        self._pieces: list[pa.Table] = []  # decoded rows up to ``_stop``
+        self._stop = 0
+
+    def read(self, first: int, stop: int) -> pa.Table:
+        """Return the rows from ``first`` to ``stop``, exclusive; neither decreases from call to call."""
+        while self._stop < stop:
+            batch = next(self._batches)
+            self._stop += batch.num_rows
+            if self._stop > first:
+                self._pieces.append(batch)
+        table = pa.concat_tables(self._pieces)
+        table = table.slice(first - (self._stop - table.num_rows))
+        self._pieces = [table]
+        return table.slice(0, stop - first)
 
 
 def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -> pa.Table | pa.RecordBatchReader:

@@ -250,8 +250,7 @@ class ParquetTable:
         memory.require(batch_bytes + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
         names = list(columns) if columns is not None else None
         try:
-            for batch in self._open_file().iter_batches(rows, columns=names, use_threads=False):
-                yield self._attach_metadata(pa.Table.from_batches([batch]))
+            yield from map(self._attach_metadata, batches_of_file(self._open_file(), rows, names))
         except BROKEN as error:
             raise _read_error(self._size, error) from error
 
@@ -280,7 +279,8 @@ def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
 
     def read_batches() -> Iterator[pa.RecordBatch]:
         try:
-            yield from file.iter_batches(rows, use_threads=False)
+            for table in batches_of_file(file, rows):
+                yield from table.combine_chunks().to_batches()
         except BROKEN as error:
             raise _read_error(size, error) from error
 
@@ -289,6 +289,25 @@ def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
         return pa.RecordBatchReader.from_batches(file.schema_arrow, read_batches())
     except BROKEN as error:
         raise _read_error(size, error) from error
+
+
+def batches_of_file(file: pq.ParquetFile, rows: int, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+    """Yield tables of ``rows`` rows, the last with the remainder.
+
+    Each row group has a reader of its own: pyarrow's reader of a whole file keeps memory for each row group that it passed.
+    """
+    remainder: pa.Table | None = None
+    for group in range(file.metadata.num_row_groups):
+        for batch in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+            table = pa.Table.from_batches([batch])
+            if remainder is not None:
+                table = pa.concat_tables([remainder, table]).combine_chunks()
+            if table.num_rows >= rows:
+                yield table.slice(0, rows)
+                table = table.slice(rows)
+            remainder = table if table.num_rows else None
+    if remainder is not None:
+        yield remainder
 
 
 def owned(*pieces: bytes | memoryview) -> pa.Buffer:

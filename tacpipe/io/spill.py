@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray, from_arrow, is_numeric
+from tacpipe.arrays import AnyArray
 from tacpipe.errors import StorageError
 from tacpipe.io.files import sentence
 from tacpipe.io.parquet import owned
@@ -194,17 +194,6 @@ class MappedArrays:
         mapped_copy[...] = values
         self.release()
         return mapped_copy
-
-    def put_aside(self, column: AnyArray | pa.Array) -> AnyArray | pa.Array:
-        """Return a column of the same values; one of texts, or with nulls, stays in memory. Raises as `empty`."""
-        if isinstance(column, np.ndarray):
-            return self.keep(column)
-        return self.keep(from_arrow(column)) if is_numeric(column) else column
-
-    @property
-    def in_memory(self) -> bool:
-        """Return whether no array is in a file."""
-        return not self._segments
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> AnyArray:
         """Return an uninitialized array. Raises `StorageError` if the disk is full."""

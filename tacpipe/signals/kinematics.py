@@ -28,10 +28,15 @@ def make_continuous(quaternions: Floats) -> Floats:
     [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]
     """
     unit: Floats = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    signs = np.ones(len(unit))  # (time,)
-    signs[1:] = np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    unit *= np.cumprod(signs)[:, None]
+    unit *= continuous_signs(unit)[:, None]
     return unit + 0.0  # -0.0 becomes 0.0, so that equal rotations have equal bytes
+
+
+def continuous_signs(quaternions: Floats) -> Floats:
+    """Return the sign (time,) of each of ``quaternions`` (time, 4) for the smaller distance to the previous one."""
+    signs = np.ones(len(quaternions))  # (time,)
+    signs[1:] = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return np.asarray(np.cumprod(signs), dtype=np.float64)
 
 
 def matrices_to_quaternions(matrices: Floats) -> Floats:

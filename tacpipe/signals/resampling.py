@@ -15,6 +15,8 @@ from tacpipe.signals.kinematics import make_continuous
 
 GAP_NS = 50_000_000  # longest time between two samples without a gap, for sensors of 20 Hz or more
 GAP_PERIODS = 2.5  # the same for slower sensors, in periods
+STEPS_AT_ONCE = 1 << 20  # number of steps between samples that are in memory at once
+HALF_BITS = 22  # bits of half a step in ns
 PARALLEL = 1e-6  # rad; below this angle, slerp divides by almost zero, and linear weights are exact to 1e-13
 
 
@@ -159,8 +161,39 @@ def default_gap_ns(t_ns: Times) -> int:
     >>> default_gap_ns(np.arange(5) * 10_000_000), default_gap_ns(np.arange(5) * 73_000_000)
     (50000000, 182500000)
     """
-    period_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    period_ns = median_step_ns(t_ns)
     return GAP_NS if period_ns <= GAP_NS else round(GAP_PERIODS * period_ns)
+
+
+def median_step_ns(t_ns: Times) -> float:
+    """Return the median time between two samples, or 0 for fewer than two. Times must not decrease."""
+    steps = len(t_ns) - 1
+    if steps < 1:
+        return 0.0
+    if steps <= STEPS_AT_ONCE:
+        return float(np.median(np.diff(t_ns)))
+    return (_ranked_step_ns(t_ns, (steps - 1) // 2) + _ranked_step_ns(t_ns, steps // 2)) / 2
+
+
+def _ranked_step_ns(t_ns: Times, rank: int) -> int:
+    """Return the step between samples that has ``rank`` if steps are sorted; those above 4 hours count as 4 hours.
+
+    Steps are counted by their upper half and then by their lower half, so that they are not in memory at once.
+    """
+    half = 1 << HALF_BITS
+    upper = -1
+    for shift in (HALF_BITS, 0):
+        counts = np.zeros(half, np.int64)
+        for first in range(0, len(t_ns) - 1, STEPS_AT_ONCE):
+            steps_ns = np.minimum(np.diff(t_ns[first : first + STEPS_AT_ONCE + 1]), half * half - 1)
+            if not shift:
+                steps_ns = steps_ns[steps_ns >> HALF_BITS == upper]
+            counts += np.bincount(steps_ns >> shift & half - 1, minlength=half)
+        part = int(np.searchsorted(np.cumsum(counts), rank, side="right"))
+        rank -= int(counts[:part].sum())
+        if shift:
+            upper = part
+    return upper * half + part
 
 
 def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.synchronization import streams
@@ -12,23 +14,105 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
+    from tacpipe.io.spill import MappedArrays
 
 MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
-Keep = Callable[[Any], Any]  # stores values (grid,), possibly on disk, and returns them
-BLOCK_BYTES = 1 << 24  # approximate size of the channels that are interpolated at once
 
 
-def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, in the order of the stream. ``keep`` stores each.
+def grid_ranges(grid_ns: Times, placed: Sequence[TimedStream], max_bytes: int) -> Iterator[slice]:
+    """Yield consecutive ranges of grid points, each with up to about ``max_bytes`` of samples and results."""
+    row_bytes = [stream.columns.row_bytes for stream in placed]
 
-    ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated.
-    """
+    def bytes_before(point: int) -> int:
+        rows = [int(stream.t_ns.searchsorted(grid_ns[point])) for stream in placed]
+        return point * sum(row_bytes) + sum(size * count for size, count in zip(row_bytes, rows, strict=True))
+
+    first = 0
+    while first < len(grid_ns):
+        further = range(first + 1, len(grid_ns))
+        stop = first + 1 + bisect_right(further, bytes_before(first) + max_bytes, key=bytes_before)
+        yield slice(first, stop)
+        first = stop
+
+
+class GridColumns:
+    """Computes the columns of a stream on a grid, for one range of grid points after another."""
+
+    def __init__(
+        self,
+        stream: TimedStream,
+        grid_ns: Times,
+        exact: Int64s | None,
+        gap_ns: int,
+        storage: MappedArrays,
+        *,
+        hold_values: bool,
+    ) -> None:
+        """Prepare the columns. ``exact`` contains the row of each grid point, if the stream has a sample at all of them.
+
+        ``storage`` may contain the times of stream and grid.
+        """
+        from tacpipe.io.columns import RowRanges
+
+        self._stream, self._grid_ns, self._exact, self._gap_ns = stream, grid_ns, exact, gap_ns
+        self._storage, self._hold_values = storage, hold_values
+        self._rows = RowRanges(stream.columns)
+        self._signs: dict[str, _Signs] = {}  # by name of a quaternion
+
+    def gaps(self) -> Bools:
+        """Return the mask of grid points (grid,) in a gap."""
+        import numpy as np
+
+        mask = np.zeros(len(self._grid_ns), dtype=bool)
+        for points in self._blocks():
+            mask[points] = _gap_mask(self._stream, self._grid_ns[points], self._gap_ns, hold_values=self._hold_values)
+        return mask
+
+    def extend_look_ahead(self, ahead_ns: Times) -> None:
+        """Increase ``ahead_ns`` (grid,) to the time from each point to the arrival of the last sample used for it."""
+        import numpy as np
+
+        for points in self._blocks():
+            exact = None if self._exact is None else self._exact[points]
+            stream_ns = _look_ahead_ns(self._stream, self._grid_ns[points], exact)
+            ahead_ns[points] = np.maximum(ahead_ns[points], stream_ns)
+
+    def _blocks(self) -> Iterator[slice]:
+        for first in range(0, len(self._grid_ns), streams.POINTS):
+            yield slice(first, first + streams.POINTS)
+            self._storage.release()
+
+    def read(self, points: slice) -> list[GridColumn]:
+        """Return fields and values of the channels at a range of grid points, and of the masks.
+
+        Ground truth has no masks. Each range follows that of the previous call.
+        """
+        at_ns, t_ns = self._grid_ns[points], self._stream.t_ns
+        first = max(0, int(t_ns.searchsorted(at_ns[0] - ONLINE_MEDIAN_NS)) - 1)
+        stop = min(len(t_ns), int(t_ns.searchsorted(at_ns[-1] + MEDIAN_NS, side="right")) + 1)
+        stream = replace(
+            self._stream,
+            columns=self._rows.read(first, stop),
+            first_row=first,
+            t_ns=t_ns[first:stop],
+            repeated=self._stream.repeated[first:stop],
+        )
+        if self._hold_values:
+            channels = _online_channels(stream, at_ns)
+            return channels + ([] if stream.truth else _online_masks(stream, at_ns, self._gap_ns))
+        exact = None if self._exact is None else self._exact[points] - first
+        channels = _channels(stream, at_ns, exact, self._signs)
+        return channels + ([] if stream.truth else _interpolated_masks(stream, at_ns, exact, self._gap_ns))
+
+
+def _channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, signs: dict[str, _Signs]) -> list[GridColumn]:
+    """Return field and values of each channel on the grid, in the order of the stream."""
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
-        return [_channel_at_rows(stream, name, exact, "none", keep) for name in stream.channels]
+        return [_channel_at_rows(stream, name, exact, "none") for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
         groups.setdefault(streams.method(stream.columns.schema, name), []).append(name)
@@ -36,25 +120,27 @@ def channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, keep: Ke
     if "nearest" in groups:
         nearest = nearest_rows(stream.t_ns, grid_ns)
         for name in groups.pop("nearest"):
-            grid_columns[name] = _channel_at_rows(stream, name, nearest, "nearest", keep)
+            grid_columns[name] = _channel_at_rows(stream, name, nearest, "nearest")
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         interpolation = method.partition(" ")[0]
+        if interpolation == "slerp":
+            parts = [stream.columns.schema.field(name) for name in members]
+            members = [members[i] for i in streams.quaternion_order(stream.name, parts)]
         rows = slice(None) if interpolation == "median" else used
-        for block in _blocks(stream, members, interpolation, len(grid_ns)):
-            columns = _interpolate_samples(stream, block, interpolation, grid_ns, rows).T
-            for name, column in zip(block, columns, strict=True):
-                kind = streams.interpolated_type(stream.columns.schema.field(name).type)
-                field = streams.grid_field(stream.name, stream.field(name), interpolation, kind)
-                grid_columns[name] = _to_column(field, column, keep)
+        values = _interpolate_samples(stream, members, interpolation, grid_ns, rows, signs.setdefault(method, _Signs()))
+        for name, column in zip(members, values.T, strict=True):
+            kind = streams.interpolated_type(stream.columns.schema.field(name).type)
+            field = streams.grid_field(stream.name, stream.field(name), interpolation, kind)
+            grid_columns[name] = _to_column(field, column)
     return [grid_columns[name] for name in stream.channels]
 
 
-def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
+def _online_channels(stream: TimedStream, grid_ns: Times) -> list[GridColumn]:
     """Return field and values of each channel on the grid, computed causally.
 
     The value is the newest sample, with the same type; for a proximity sensor, the median of the last
-    `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it. ``keep`` stores each channel.
+    `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it.
     """
     from tacpipe.signals.resampling import median_before, newest_rows
 
@@ -65,34 +151,49 @@ def online_channels(stream: TimedStream, grid_ns: Times, keep: Keep) -> list[Gri
             kind = streams.interpolated_type(stream.columns.schema.field(name).type)
             field = streams.grid_field(stream.name, stream.field(name), "median", kind)
             values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, ONLINE_MEDIAN_NS)
-            grid_columns.append(_to_column(field, values[:, 0], keep))
+            grid_columns.append(_to_column(field, values[:, 0]))
         else:
-            grid_columns.append(_channel_at_rows(stream, name, rows, "hold", keep))
+            grid_columns.append(_channel_at_rows(stream, name, rows, "hold"))
     return grid_columns
 
 
-def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolation: str, keep: Keep) -> GridColumn:
+def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolation: str) -> GridColumn:
     """Return field and values of a channel at ``rows`` with the same type; ``interpolation`` names the method."""
-    return streams.grid_field(stream.name, stream.field(name), interpolation), keep(stream.at(name, rows))
+    return streams.grid_field(stream.name, stream.field(name), interpolation), stream.at(name, rows)
 
 
-def _blocks(stream: TimedStream, members: list[str], interpolation: str, points: int) -> list[list[str]]:
-    """Return the channels to interpolate at once: the four of a quaternion, or as many as fit in a block.
+class _Signs:
+    """Continues the signs of a quaternion's samples from range to range, as if all were in one."""
 
-    Raises `TacpipeError` if a quaternion lacks a component.
-    """
-    if interpolation == "slerp":
-        parts = [stream.columns.schema.field(name) for name in members]
-        return [[members[i] for i in streams.quaternion_order(stream.name, parts)]]
-    rows = len(stream.t_ns) if interpolation == "median" else points
-    size = max(1, BLOCK_BYTES // (8 * max(1, rows)))
-    return [members[first : first + size] for first in range(0, len(members), size)]
+    def __init__(self) -> None:
+        import numpy as np
+
+        self._rows = np.zeros(0, np.int64)  # the last rows of the ranges so far
+        self._unit = np.zeros((0, 4))
+        self._signs = np.zeros(0)
+
+    def apply(self, rows: Int64s, quaternions: Floats) -> Floats:
+        """Return ``quaternions`` (time, 4) at ``rows`` with the signs that they have in the series of all ranges."""
+        import numpy as np
+
+        from tacpipe.signals.kinematics import continuous_signs
+
+        later = rows > self._rows[-1] if len(self._rows) else np.ones(len(rows), dtype=bool)
+        unit = quaternions[later] / np.linalg.norm(quaternions[later], axis=1, keepdims=True)
+        signs = continuous_signs(np.concatenate([self._unit[-1:], unit]))
+        if len(self._rows):
+            signs = signs[1:] * self._signs[-1]
+        self._rows, self._unit, self._signs = (
+            np.concatenate(parts)[-len(rows) :]
+            for parts in ((self._rows, rows[later]), (self._unit, unit), (self._signs, signs))
+        )
+        return quaternions * self._signs[self._rows.searchsorted(rows), None]
 
 
 def _interpolate_samples(
-    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any
+    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any, signs: _Signs
 ) -> Floats:
-    """Return the values of channels at grid points (grid, channel), interpolated from the rows ``used``."""
+    """Interpolate channels (grid, channel) from the rows ``used``; ``signs`` are those of a quaternion."""
     import numpy as np
 
     from tacpipe.signals.resampling import linear, median_around, slerp
@@ -100,37 +201,31 @@ def _interpolate_samples(
     t_ns = stream.t_ns[used]
     values = np.stack([stream.values(name)[used] for name in names], axis=1)  # (time, channel)
     if interpolation == "slerp":
-        return slerp(t_ns, values.astype(np.float64), grid_ns)
+        return slerp(t_ns, signs.apply(stream.first_row + used, values.astype(np.float64)), grid_ns)
     if interpolation == "median":
         return median_around(t_ns, values, grid_ns, MEDIAN_NS)
     return linear(t_ns, values, grid_ns)
 
 
-def _to_column(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
+def _to_column(kind: pa.Field, column: Floats) -> GridColumn:
     import numpy as np
 
-    return kind, keep(np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype()))
+    return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
 
 
-def masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample in ns.
-
-    ``exact`` are the rows whose times are the grid points, or None.
-    """
+def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
+    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample."""
     import numpy as np
 
-    from tacpipe.signals.resampling import in_gap, nearest_rows
+    from tacpipe.signals.resampling import nearest_rows
 
     rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
-    gap = in_gap(stream.t_ns, grid_ns, gap_ns)
+    gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=False)
     return _masks(stream.name, stream.repeated[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
 
 
-def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
-    """Return the time (grid,) in ns from each point to the arrival of the last sample that `channels` uses for it.
-
-    It is 0 if that sample arrived before.
-    """
+def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
+    """Return the time (grid,) from each point to the arrival of the last sample that is used for it, at least 0."""
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
@@ -141,13 +236,22 @@ def look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> 
     return look_ahead
 
 
-def online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample in ns."""
-    from tacpipe.signals.resampling import is_overdue, newest_rows
+def _online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
+    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample."""
+    from tacpipe.signals.resampling import newest_rows
 
     rows = newest_rows(stream.t_ns, grid_ns)
-    newest_ns = stream.t_ns[rows]
-    return _masks(stream.name, stream.repeated[rows], is_overdue(newest_ns, grid_ns, gap_ns), grid_ns - newest_ns)
+    gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=True)
+    return _masks(stream.name, stream.repeated[rows], gap, grid_ns - stream.t_ns[rows])
+
+
+def _gap_mask(stream: TimedStream, grid_ns: Times, gap_ns: int, *, hold_values: bool) -> Bools:
+    """Return the mask of grid points (grid,) in a gap between samples, or after a sample that is too old."""
+    from tacpipe.signals.resampling import in_gap, is_overdue, newest_rows
+
+    if hold_values:
+        return is_overdue(stream.t_ns[newest_rows(stream.t_ns, grid_ns)], grid_ns, gap_ns)
+    return in_gap(stream.t_ns, grid_ns, gap_ns)
 
 
 def _masks(name: str, repeated: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:

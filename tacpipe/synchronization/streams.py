@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe import printable
 from tacpipe.channels import arm
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times
     from tacpipe.io.columns import Columns
+    from tacpipe.io.spill import MappedArrays
 
 
 TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
@@ -24,6 +25,8 @@ DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a 
 # column of the recorder with the maximum delay of each arrival time; not a channel
 UNCERTAIN = "t_uncertain_ns"
 NOT_INTERPOLATED = ("label", "time", "mask")  # quantities whose nearest sample is used
+TURN = 1 << 16  # counts between two wraps
+POINTS = 1 << 18  # number of times that are compared at once
 
 
 def channel_names(schema: pa.Schema) -> list[str]:
@@ -95,6 +98,20 @@ def join_names(names: Iterable[Any]) -> str:
 SESSION_QUANTITIES = ("time", "plan", "prediction", "latency", "alarm", "material")
 
 
+class Wraps(NamedTuple):
+    """The wraps of a channel of 16-bit counts."""
+
+    rows: Int64s  # (wrap,), the first row after each wrap
+    turns: Int32s  # (wrap + 1,), turns before the first wrap, which is 0, and after each wrap
+
+    def undo(self, counts: AnyArray, first: int) -> Int32s:
+        """Return ``counts`` (time,) of the rows from ``first`` as int32 without wraps."""
+        import numpy as np
+
+        turns = self.turns[self.rows.searchsorted(np.arange(first, first + len(counts)), side="right")]
+        return np.asarray(counts.astype(np.int32) + TURN * turns, dtype=np.int32)
+
+
 @dataclass(frozen=True)
 class TimedStream:
     """A stream of a recording with sampling times on the host's clock."""
@@ -105,7 +122,8 @@ class TimedStream:
     repeated: Bools  # (time,): True if a sample repeats the previous one
     arrival_ns: Times  # (time,): arrival times on the host's clock
     attributes: dict[str, Attribute] = field(default_factory=dict)  # results of the clock fit
-    unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels with unwrapped counts
+    wraps: Mapping[str, Wraps] = field(default_factory=dict)  # channels whose counts are unwrapped
+    first_row: int = 0  # number of samples before these
 
     @property
     def channels(self) -> list[str]:
@@ -117,23 +135,21 @@ class TimedStream:
         import pyarrow as pa
 
         channel = self.columns.schema.field(name)
-        return channel.with_type(pa.int32()) if name in self.unwrapped else channel
+        return channel.with_type(pa.int32()) if name in self.wraps else channel
 
     def values(self, name: str) -> AnyArray:
         """Return a numeric channel (time,)."""
         from tacpipe.arrays import from_arrow
 
-        unwrapped_values = self.unwrapped.get(name)
-        return from_arrow(self.columns.column(name)) if unwrapped_values is None else unwrapped_values
+        counts = from_arrow(self.columns.column(name))
+        return self.wraps[name].undo(counts, self.first_row) if name in self.wraps else counts
 
     def at(self, name: str, rows: Indices) -> AnyArray | pa.Array:
         """Return a channel of any type at ``rows``; numbers without nulls are an array of numpy."""
-        from tacpipe.arrays import from_arrow, is_numeric, to_arrow
+        from tacpipe.arrays import is_numeric, to_arrow
 
-        if name in self.unwrapped:
-            return self.unwrapped[name][rows]
         column = self.columns.column(name)
-        return from_arrow(column)[rows] if is_numeric(column) else column.take(to_arrow(rows)).combine_chunks()
+        return self.values(name)[rows] if is_numeric(column) else column.take(to_arrow(rows)).combine_chunks()
 
     @property
     def truth(self) -> bool:
@@ -160,13 +176,14 @@ def may_be_signal(schema: pa.Schema) -> bool:
     )
 
 
-def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> TimedStream:
-    """Return a stream with times on the host's clock. ``clock`` selects the times: device, arrival or auto.
+def to_host_clock(recording: str, name: str, columns: Columns, clock: str, storage: MappedArrays) -> TimedStream:
+    """Convert a stream to the host's clock. ``clock`` selects the times: device, arrival or auto.
 
-    Raises `TacpipeError` if times are missing or decrease, or the device's clock cannot be fitted.
+    Times and repeats are kept in ``storage``. Raises `TacpipeError` if times are missing or decrease, or the device's clock
+    cannot be fitted.
     """
-    arrival_ns = _stamps(recording, name, columns)
-    stream = TimedStream(name, columns, arrival_ns, _repeated_rows(columns), arrival_ns)
+    arrival_ns = _stamps(recording, name, columns, storage)
+    stream = TimedStream(name, columns, arrival_ns, _repeated_rows(columns, storage), arrival_ns)
     if clock == "arrival" or stream.truth:
         return stream
     if DEVICE not in columns.column_names:
@@ -177,7 +194,7 @@ def to_host_clock(recording: str, name: str, columns: Columns, clock: str) -> Ti
             )
         return stream
     t_ns, attributes = _convert_device_times(recording, name, columns, stream.t_ns)
-    return replace(stream, t_ns=t_ns, attributes=attributes)
+    return replace(stream, t_ns=storage.keep(t_ns), attributes=attributes)
 
 
 def _convert_device_times(
@@ -220,7 +237,7 @@ def _certain(columns: Columns) -> Bools | None:
     return certain
 
 
-def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
+def _stamps(recording: str, stream: str, columns: Columns, storage: MappedArrays) -> Int64s:
     """Return the arrival times (time,) in ns of a stream. Raises `TacpipeError` if there are none, or they decrease."""
     import numpy as np
 
@@ -231,49 +248,87 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
             f"Recording {recording}: stream {stream!r} has no rows with t_ns. Exclude the recording with "
             f"`tacpipe label --exclude`, or record it again."
         )
-    t_ns: Times = from_arrow(columns.column("t_ns"))
-    decreases = np.diff(t_ns) < 0
-    if decreases.any():
-        row = int(decreases.argmax()) + 1
-        raise TacpipeError(
-            f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
-            f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
-        )
+    t_ns: Times = storage.empty((columns.num_rows,), columns.schema.field("t_ns").type.to_pandas_dtype())
+    first = 0
+    for batch in columns.batches(["t_ns"]):
+        stop = first + batch.num_rows
+        t_ns[first:stop] = from_arrow(batch.column("t_ns"))
+        before = max(0, first - 1)
+        decreases = np.diff(t_ns[before:stop]) < 0
+        if decreases.any():
+            row = before + int(decreases.argmax()) + 1
+            raise TacpipeError(
+                f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
+                f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
+            )
+        first = stop
+        storage.read(batch.nbytes)
     return t_ns
 
 
-def unwrap_counts(stream: TimedStream, keep: Callable[[Any], Any]) -> tuple[TimedStream, int]:
-    """Return a stream with unwrapped 16-bit tactile counts, and the number of channels that wrapped.
-
-    ``keep`` stores the values of such a channel, possibly on disk, and returns them.
-    """
+def unwrap_counts(stream: TimedStream) -> TimedStream:
+    """Return a stream whose 16-bit tactile counts are unwrapped."""
     import pyarrow as pa
 
-    from tacpipe.arrays import from_arrow
-    from tacpipe.signals.repairs import unwrap
-
-    changed: dict[str, Int32s] = {}
-    for channel in stream.columns.schema:
-        tactile = (channel.metadata or {}).get(b"quantity") == b"tactile"
-        if tactile and pa.types.is_integer(channel.type) and channel.type.bit_width == 16:
-            values = from_arrow(stream.columns.column(channel.name))
-            unwrapped_values = unwrap(values)
-            if unwrapped_values is not values:
-                changed[channel.name] = keep(unwrapped_values)
-    return replace(stream, unwrapped=changed), len(changed)
+    names = []
+    for kind in stream.columns.schema:
+        tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
+        if tactile and pa.types.is_integer(kind.type) and kind.type.bit_width == 16:
+            names.append(kind.name)
+    return replace(stream, wraps=_find_wraps(stream.columns, names)) if names else stream
 
 
-def _repeated_rows(columns: Columns) -> Bools:
-    """Return a mask (time,) of rows that repeat the previous row in all channels but labels, which are often constant."""
+def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
+    """Return the wraps of the channels that have any. Channels with empty rows have none."""
     import numpy as np
 
+    from tacpipe.arrays import from_arrow, is_numeric
+    from tacpipe.signals.repairs import HALF, count_wraps
+
+    steps: dict[str, list[tuple[Int64s, Int32s]]] = {name: [] for name in names}
+    last: dict[str, int] = {}  # count in the row before a batch
+    first = 0
+    for batch in columns.batches(names):
+        for name in list(steps):
+            if not is_numeric(column := batch.column(name)):
+                del steps[name]
+                continue
+            counts = from_arrow(column)
+            before, last[name] = last.get(name, int(counts[0])), int(counts[-1])
+            if max(before, int(counts.max())) - min(before, int(counts.min())) > HALF:
+                turned = count_wraps(np.concatenate([[before], counts]).astype(np.int32))
+                rows = np.flatnonzero(turned)
+                steps[name].append((first + rows, turned[rows]))
+        first += batch.num_rows
+    wraps = {}
+    for name, parts in steps.items():
+        if parts and sum(len(rows) for rows, _ in parts):
+            rows, turned = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+            wraps[name] = Wraps(rows, np.cumsum(np.append(0, turned), dtype=np.int32))
+    return wraps
+
+
+def _repeated_rows(columns: Columns, storage: MappedArrays) -> Bools:
+    """Return a mask (time,) of rows that repeat the previous row in all channels but labels, which are often constant."""
     from tacpipe.arrays import from_arrow
-    from tacpipe.signals.repairs import repeated_in_columns
 
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
-    if not names:
-        return np.zeros(columns.num_rows, dtype=bool)
-    return repeated_in_columns(from_arrow(columns.column(name)) for name in names)
+    repeated: Bools = storage.empty((columns.num_rows,), bool)
+    repeated[:] = bool(names)
+    repeated[:1] = False
+    for name in names:
+        first, last, repeats = 0, None, False
+        for batch in columns.batches([name]):
+            values = from_arrow(batch.column(name))
+            mask = repeated[first : first + len(values)]
+            mask[:1] &= first > 0 and values[0] == last
+            mask[1:] &= values[1:] == values[:-1]
+            repeats = repeats or bool(mask.any())
+            first, last = first + len(values), values[-1]
+            storage.read(mask.nbytes)
+        if not repeats:
+            break
+    return repeated
 
 
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
@@ -300,49 +355,77 @@ def grid(
     rate_hz: float | None,
     streams: Mapping[str, TimedStream],
     master: TimedStream,
+    storage: MappedArrays,
     *,
     hold_values: bool,
 ) -> tuple[Int64s, Int64s]:
     """Return the grid points (grid,) in ns within all streams, and their rows in the master or in the uniform grid.
 
     A uniform grid starts at the master's first sample. With ``hold_values`` the grid ends with the last stream, because
-    online the last sample of a stream is unknown, and equal times become one point. Raises `TacpipeError` if there are no
-    points.
+    online the last sample of a stream is unknown, and equal times become one point. The results are kept in ``storage``.
+    Raises `TacpipeError` if there are no points.
     """
     import numpy as np
 
-    from tacpipe.signals.resampling import uniform_grid
+    from tacpipe.signals.resampling import uniform_offsets
 
-    first = max(int(stream.t_ns[0]) for stream in streams.values())
-    last = (max if hold_values else min)(int(stream.t_ns[-1]) for stream in streams.values())
-    grid_ns = uniform_grid(int(master.t_ns[0]), last, rate_hz) if rate_hz is not None else master.t_ns
-    selected = (grid_ns >= first) & (grid_ns <= last)
-    if kind == "fresh":
-        selected &= ~master.repeated
-    if hold_values and rate_hz is None:
-        selected &= np.append(np.diff(grid_ns) > 0, True)
-    rows = np.flatnonzero(selected)
-    if not len(rows):
-        latest = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
-        earliest = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
+    first_ns = max(int(stream.t_ns[0]) for stream in streams.values())
+    last_ns = (max if hold_values else min)(int(stream.t_ns[-1]) for stream in streams.values())
+    origin_ns, count = int(master.t_ns[0]), len(master.t_ns)
+    if rate_hz is not None:
+        count = max(0, int((last_ns - origin_ns) * rate_hz / 1e9) + 2)
+    grid_ns, rows = (storage.empty((count,), dtype) for dtype in (master.t_ns.dtype, np.int64))
+    points = 0
+    for first in range(0, count, POINTS):
+        stop = min(first + POINTS, count)
+        if rate_hz is not None:
+            block_ns = origin_ns + uniform_offsets(first, stop - first, rate_hz)
+        else:
+            block_ns = master.t_ns[first:stop]
+        selected = (block_ns >= first_ns) & (block_ns <= last_ns)
+        if kind == "fresh":
+            selected &= ~master.repeated[first:stop]
+        if hold_values and rate_hz is None:
+            steps_ns = np.diff(master.t_ns[first : stop + 1])
+            selected[: len(steps_ns)] &= steps_ns > 0
+        chosen = np.flatnonzero(selected)
+        grid_ns[points : points + len(chosen)], rows[points : points + len(chosen)] = block_ns[chosen], first + chosen
+        points += len(chosen)
+        storage.read(4 * block_ns.nbytes)
+    if not points:
+        late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
+        early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
             f"Recording {recording}: no row of {master.name} is within the time range of all streams. Stream {latest.name} "
             f"starts last, at {printable.moment(int(latest.t_ns[0]))}, and {earliest.name} ends first, at "
             f"{printable.moment(int(earliest.t_ns[-1]))}. Exclude one of them with --without, or check their clocks."
         )
-    return grid_ns[rows], rows
+    return grid_ns[:points], rows[:points]
 
 
-def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s) -> Int64s | None:
+def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s, storage: MappedArrays) -> Int64s | None:
     """Return the rows whose times equal the grid points, or None if a grid point has no sample.
 
-    ``grid_rows`` (grid,) are the rows of a stream with the same clock as the grid.
+    ``grid_rows`` (grid,) are the rows of a stream with the same clock as the grid, which may repeat times. The result is
+    kept in ``storage``.
     """
     import numpy as np
 
-    rows: Int64s = np.searchsorted(t_ns, grid_ns[0]) + grid_rows - grid_rows[0]
-    if rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns):
-        return rows  # both have the same clock, possibly with repeated times
-    rows = np.searchsorted(t_ns, grid_ns).astype(np.int64)
-    is_equal = rows[-1] < len(t_ns) and np.array_equal(t_ns[rows], grid_ns)
-    return rows if is_equal else None
+    def shifted(block: slice) -> Int64s:
+        return np.asarray(grid_rows[block] + (t_ns.searchsorted(grid_ns[0]) - grid_rows[0]))
+
+    def first_rows(block: slice) -> Int64s:
+        return t_ns.searchsorted(grid_ns[block]).astype(np.int64)
+
+    for search in (shifted, first_rows):
+        exact = storage.empty(grid_ns.shape, np.int64)
+        for first in range(0, len(grid_ns), POINTS):
+            block = slice(first, first + POINTS)
+            rows = search(block)
+            if rows[-1] >= len(t_ns) or not np.array_equal(t_ns[rows], grid_ns[block]):
+                break
+            exact[block] = rows
+            storage.read(4 * rows.nbytes)
+        else:
+            return exact
+    return None

@@ -161,3 +161,14 @@ def test_a_median_of_the_past_has_the_samples_of_its_span_or_the_newest() -> Non
 def test_a_stream_is_overdue_once_its_newest_sample_is_older_than_the_gap() -> None:
     newest_ns, grid_ns = EPOCH_NS + np.array([0, 0, 0]), EPOCH_NS + np.array([49, 50, 51])
     assert resampling.is_overdue(newest_ns, grid_ns, 50).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("count", [2, 150, 151])
+@pytest.mark.parametrize("longest", [0, 5, 10**12])
+def test_the_median_step_of_many_samples_is_that_of_all_steps_at_once(
+    monkeypatch: pytest.MonkeyPatch, count: int, longest: int
+) -> None:
+    t_ns = EPOCH_NS + np.cumsum(np.random.default_rng(0).integers(0, longest + 1, count))
+    monkeypatch.setattr(resampling, "STEPS_AT_ONCE", 10)
+    assert resampling.median_step_ns(t_ns) == np.median(np.diff(t_ns))
+    assert resampling.median_step_ns(t_ns[:1]) == 0

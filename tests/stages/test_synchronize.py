@@ -15,9 +15,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import columns
+from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.params import from_json, to_json
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.synchronization import streams as grids
 from tests.fake_recordings import FakeRecording
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -60,19 +63,38 @@ def run(shard: Any, **values: Any) -> tuple[pa.Table, Any]:
 
 
 @pytest.mark.parametrize("values", ["hold", "interpolate"])
-@pytest.mark.parametrize("rate_hz", [None, 200.0])
-def test_columns_that_are_put_aside_on_disk_give_the_rows_of_those_in_memory(
-    shard: Recording, monkeypatch: pytest.MonkeyPatch, values: str, rate_hz: float | None
+@pytest.mark.parametrize("rows", [{}, {"rate_hz": 200.0}, {"rate_hz": 2500.0}, {"grid": "fresh"}])
+@pytest.mark.parametrize("block_bytes", [1, 20_000])
+def test_a_long_recording_that_is_read_in_blocks_gives_the_rows_of_one_block(
+    shard: Recording, monkeypatch: pytest.MonkeyPatch, values: str, rows: dict[str, Any], block_bytes: int
 ) -> None:
-    wrapping = (np.arange(400)[:, None] * 700 + np.arange(48)) % 65_536
-    streams = {"robot": robot(np.arange(-30, 395)), "xela1": uskin(np.arange(400), wrapping.astype(np.uint16))}
-    in_memory = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
+    wrapping = ((np.arange(400)[:, None] * 700 + np.arange(48)) % 65_536).astype(np.uint16)
+    wrapping[7::3] = wrapping[6:-1:3]
+    arm = robot(np.arange(-30, 395))
+    components = [arm.column(f"orientation_{part}").to_numpy().copy() for part in "xyzw"]
+    for component in components:
+        component[100:103] = np.nan  # an unseen marker
+        component[200::7] *= -1  # the same rotation
+    for part, component in zip("xyzw", components, strict=True):
+        place = arm.schema.get_field_index(f"orientation_{part}")
+        arm = arm.set_column(place, arm.schema.field(place), pa.array(component))
+    readings = np.random.default_rng(3).integers(0, 999, 160)
+    near = schema.stream(
+        T0 + np.arange(-3, 397, 2.5) * MS,
+        [readings],
+        [pa.field("near", pa.uint16(), metadata={"quantity": "proximity"})],
+    )
+    streams = {"robot": arm, "xela1": uskin(np.arange(400), wrapping), "near": near}
+    expected = synchronize(params(values=values, **rows), shard(streams))
     module = sys.modules[synchronize.function.__module__]
     monkeypatch.setattr(module, "IN_MEMORY", 1000)
-    monkeypatch.setattr(module, "BATCH_ROWS", 17)
-    parts = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
-    assert parts.streams[""].read_all().equals(in_memory.streams[""], check_metadata=True)
-    assert (parts.attributes, parts.notes) == (in_memory.attributes, in_memory.notes)
+    monkeypatch.setattr(module, "BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr(grids, "POINTS", 19)
+    monkeypatch.setattr(columns.Columns.batches, "__defaults__", (None, 13))
+    monkeypatch.setattr(columns, "BLOCK_BYTES", 5000)
+    parts = synchronize(params(values=values, **rows), shard(streams))
+    assert to_parquet(parts.streams[""].read_all()) == to_parquet(expected.streams[""])
+    assert (parts.attributes, parts.notes) == (expected.attributes, expected.notes)
 
 
 def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_does(shard: Recording) -> None:
