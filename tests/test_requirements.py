@@ -50,7 +50,7 @@ def without(quantity: str) -> FakeShard:
 
 
 def read(shard: Any, actions: str) -> tracks.Track:
-    codec = tracks.codec_of(shard.content, {}, shard.name)
+    codec = tracks.codec_of(shard.content.schema, {}, shard.name)
     return tracks.track(shard, codec, tracks.select_pose(shard, actions))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Floats, Times
+from tacpipe.arrays import AnyFloats, Floats, Indices, Times
 
 UPRIGHT = 1e-12  # distance of a sine from 1 below which the angle counts as a right angle
 
@@ -37,6 +37,28 @@ def continuous_signs(quaternions: Floats) -> Floats:
     signs = np.ones(len(quaternions))  # (time,)
     signs[1:] = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(np.cumprod(signs), dtype=np.float64)
+
+
+class SignContinuation:
+    """Continues the signs of quaternions from part to part of a series, as `make_continuous` does in the whole series."""
+
+    def __init__(self) -> None:
+        self._rows = np.zeros(0, np.int64)  # rows of the last part
+        self._unit = np.zeros((0, 4))
+        self._signs = np.zeros(0)
+
+    def apply(self, rows: Indices, quaternions: Floats) -> Floats:
+        """Return ``quaternions`` (time, 4) at the ascending ``rows`` with continuous signs. Parts may overlap."""
+        later = rows > self._rows[-1] if len(self._rows) else np.ones(len(rows), dtype=bool)
+        unit = quaternions[later] / np.linalg.norm(quaternions[later], axis=1, keepdims=True)
+        signs = continuous_signs(np.concatenate([self._unit[-1:], unit]))
+        if len(self._rows):
+            signs = signs[1:] * self._signs[-1]
+        self._rows, self._unit, self._signs = (
+            np.concatenate(parts)[-len(rows) :]
+            for parts in ((self._rows, rows[later]), (self._unit, unit), (self._signs, signs))
+        )
+        return quaternions * self._signs[self._rows.searchsorted(rows), None]
 
 
 def matrices_to_quaternions(matrices: Floats) -> Floats:
@@ -181,10 +203,22 @@ def carries_hand(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats)
 
     If not, the hand belongs to another arm. Non-finite rows are ignored.
     """
+    tool_m = np.concatenate(
+        [np.zeros((0, 3)), *(tool_positions(chain, joint_rad[block], hand_m[block]) for block in _blocks(len(hand_m)))]
+    )
+    return is_fixed(tool_m)
+
+
+def tool_positions(chain: KinematicChain, joint_rad: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
+    """Return the finite positions of ``hand_m`` (time, 3) in the frame of the chain's last link."""
     finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
     last = last_frames(chain, joint_rad[finite])
-    # (time, 3), in the frame of the last link
-    tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m[finite] - last[:, :3, 3])
+    tool_m: AnyFloats = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m[finite] - last[:, :3, 3])
+    return tool_m
+
+
+def is_fixed(tool_m: AnyFloats) -> bool:
+    """Return whether positions (time, 3) in the frame of a link do not move in it."""
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
 
 

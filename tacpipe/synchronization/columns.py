@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
     from tacpipe.io.spill import MappedArrays
+    from tacpipe.signals.kinematics import SignContinuation
 
 MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
@@ -59,7 +60,7 @@ class GridColumns:
         self._stream, self._grid_ns, self._exact, self._gap_ns = stream, grid_ns, exact, gap_ns
         self._storage, self._hold_values = storage, hold_values
         self._rows = RowRanges(stream.columns)
-        self._signs: dict[str, _Signs] = {}  # by name of a quaternion
+        self._signs: dict[str, SignContinuation] = {}  # by name of a quaternion
 
     def gaps(self) -> Bools:
         """Return the mask of grid points (grid,) in a gap."""
@@ -107,8 +108,11 @@ class GridColumns:
         return channels + ([] if stream.truth else _interpolated_masks(stream, at_ns, exact, self._gap_ns))
 
 
-def _channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, signs: dict[str, _Signs]) -> list[GridColumn]:
+def _channels(
+    stream: TimedStream, grid_ns: Times, exact: Int64s | None, signs: dict[str, SignContinuation]
+) -> list[GridColumn]:
     """Return field and values of each channel on the grid, in the order of the stream."""
+    from tacpipe.signals.kinematics import SignContinuation
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
@@ -128,7 +132,9 @@ def _channels(stream: TimedStream, grid_ns: Times, exact: Int64s | None, signs: 
             parts = [stream.columns.schema.field(name) for name in members]
             members = [members[i] for i in streams.quaternion_order(stream.name, parts)]
         rows = slice(None) if interpolation == "median" else used
-        values = _interpolate_samples(stream, members, interpolation, grid_ns, rows, signs.setdefault(method, _Signs()))
+        values = _interpolate_samples(
+            stream, members, interpolation, grid_ns, rows, signs.setdefault(method, SignContinuation())
+        )
         for name, column in zip(members, values.T, strict=True):
             kind = streams.interpolated_type(stream.columns.schema.field(name).type)
             field = streams.grid_field(stream.name, stream.field(name), interpolation, kind)
@@ -162,36 +168,8 @@ def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolatio
     return streams.grid_field(stream.name, stream.field(name), interpolation), stream.at(name, rows)
 
 
-class _Signs:
-    """Continues the signs of a quaternion's samples from range to range, as if all were in one."""
-
-    def __init__(self) -> None:
-        import numpy as np
-
-        self._rows = np.zeros(0, np.int64)  # the last rows of the ranges so far
-        self._unit = np.zeros((0, 4))
-        self._signs = np.zeros(0)
-
-    def apply(self, rows: Int64s, quaternions: Floats) -> Floats:
-        """Return ``quaternions`` (time, 4) at ``rows`` with the signs that they have in the series of all ranges."""
-        import numpy as np
-
-        from tacpipe.signals.kinematics import continuous_signs
-
-        later = rows > self._rows[-1] if len(self._rows) else np.ones(len(rows), dtype=bool)
-        unit = quaternions[later] / np.linalg.norm(quaternions[later], axis=1, keepdims=True)
-        signs = continuous_signs(np.concatenate([self._unit[-1:], unit]))
-        if len(self._rows):
-            signs = signs[1:] * self._signs[-1]
-        self._rows, self._unit, self._signs = (
-            np.concatenate(parts)[-len(rows) :]
-            for parts in ((self._rows, rows[later]), (self._unit, unit), (self._signs, signs))
-        )
-        return quaternions * self._signs[self._rows.searchsorted(rows), None]
-
-
 def _interpolate_samples(
-    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any, signs: _Signs
+    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any, signs: SignContinuation
 ) -> Floats:
     """Interpolate channels (grid, channel) from the rows ``used``; ``signs`` are those of a quaternion."""
     import numpy as np

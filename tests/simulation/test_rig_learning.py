@@ -173,7 +173,7 @@ def bound_without_plan() -> float:
     forecast = acceleration_forecast()
     missed, moved = 0.0, 0.0
     for shard in trials(TESTED, **STICK):
-        track = tracks.track(shard, tracks.codec_of(shard.content, {}))  # type: ignore[arg-type]
+        track = tracks.track(shard, tracks.codec_of(shard.content.schema, {}))  # type: ignore[arg-type]
         starts = track.starts(10, HORIZON)
         starts = starts[aloft(shard, starts) & (starts >= max(LAGS))]
         now = starts + 9

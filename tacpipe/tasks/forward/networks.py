@@ -23,13 +23,15 @@ from tacpipe.models.forecasts import Ensemble
 from tacpipe.models.tensors import require_network, require_output
 from tacpipe.models.windows import ARM, POSE, ForecastShape, ForecastWindows
 from tacpipe.tasks.forward.params import ForwardModelParams
-from tacpipe.tasks.forward.tracks import Levels, Track
+from tacpipe.tasks.forward.tracks import BLOCK_ROWS, Levels, Track
 from tacpipe.training import loop
 
 if TYPE_CHECKING:
     from tacpipe.tasks.forward.forecaster import Forecaster
 
 ACTIONS = ("planned", "none", "shuffled")
+WINDOWS = 512  # windows that are read from files at once
+PAGE_BYTES = 4096  # memory of a file's page, which a row occupies at least
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,21 @@ class Rows:
         """Return the windows that start at ``starts`` (window,), and their future touch (horizon, window, feature)."""
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
-        touch, arm = (values.index_select(0, rows.flatten()).view(*rows.shape, -1) for values in (self.touch, self.arm))
+        touch, arm = (self._select(values, rows) for values in (self.touch, self.arm))
         if self.plan_velocity is not None:
-            arm[self.context :, :, windows_of.POSE :] = self.plan_velocity[rows[self.context :]]
-        if self.mapped is not None:
-            self.mapped.read(touch.nbytes + arm.nbytes)
+            arm[self.context :, :, windows_of.POSE :] = self._select(self.plan_velocity, rows[self.context :])
         return ForecastWindows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
+
+    def _select(self, values: Tensor, rows: Tensor) -> Tensor:
+        """Return ``values`` (time, feature) at ``rows`` (row, window), (row, window, feature)."""
+        if self.mapped is None:
+            return values.index_select(0, rows.flatten()).view(*rows.shape, -1)
+        selected = values.new_empty(*rows.shape, values.shape[1])
+        for first in range(0, rows.shape[1], WINDOWS):
+            part = rows[:, first : first + WINDOWS]
+            selected[:, first : first + WINDOWS] = values.index_select(0, part.flatten()).view(*part.shape, -1)
+            self.mapped.read(part.numel() * PAGE_BYTES)
+        return selected
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
         """Return the mean loss of the windows with these indices (window,)."""
@@ -74,21 +85,49 @@ class Rows:
         ends = torch.from_numpy(np.cumsum([len(track.t_ns) for track in self.tracks]))
         return torch.searchsorted(ends, starts.cpu().contiguous(), right=True)
 
+    @property
+    def channels(self) -> int:
+        """The number of tactile channels."""
+        return self.tracks[0].tactile.shape[1] if self.tracks else 0
+
     def tactile(self, rows: Int64s) -> AnyFloats:
         """Return counts above rest (window, row, channel) at ``rows`` (window, row); each window is in one track."""
         ends = np.cumsum([len(track.t_ns) for track in self.tracks])
         track_numbers = np.searchsorted(ends, rows[:, 0], side="right")  # (window,)
-        levels = np.empty((*rows.shape, self.tracks[0].tactile.shape[1] if self.tracks else 0))
+        levels = np.empty((*rows.shape, self.channels))
         for number in np.unique(track_numbers):
-            track, of_track = self.tracks[number], track_numbers == number
-            levels[of_track] = track.tactile[rows[of_track] - (ends[number] - len(track.t_ns))]
-            if self.mapped is not None:
-                self.mapped.release()
+            track, windows = self.tracks[number], np.flatnonzero(track_numbers == number)
+            for first in range(0, len(windows), WINDOWS):
+                part = windows[first : first + WINDOWS]
+                levels[part] = track.tactile[rows[part] - (ends[number] - len(track.t_ns))]
+                if self.mapped is not None:
+                    self.mapped.release()
         return levels
 
     def evenly_spread(self, limit: int) -> Tensor:
         """Return at most ``limit`` evenly spaced starts of windows (window,)."""
         return self.starts[:: max(1, -(-len(self.starts) // limit))]
+
+
+class WindowLevels:
+    """Counts above rest (window, row, channel) at rows of windows, computed for the windows that are indexed."""
+
+    ndim = 3
+
+    def __init__(self, source: Rows, rows: Int64s) -> None:
+        """Prepare the levels of ``source`` at ``rows`` (window, row)."""
+        self._source, self._rows = source, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of windows, rows and channels."""
+        return (*self._rows.shape, self._source.channels)
+
+    def __getitem__(self, windows: slice) -> AnyFloats:
+        return self._source.tactile(self._rows[windows])
 
 
 def rows_of_tracks(
@@ -110,14 +149,14 @@ def rows_of_tracks(
     offsets = np.cumsum([0] + [len(track.t_ns) for track in tracks])
 
     def stack_parts(parts: Sequence[AnyFloats | Levels], width: tuple[int, ...]) -> Tensor:
-        if len(parts) == 1 and mapped is None:
-            return torch.from_numpy(np.ascontiguousarray(parts[0][:], dtype=np.float32)).to(device)
         shape = (int(offsets[-1]), *width)
         values: AnyFloats = np.empty(shape, np.float32) if mapped is None else mapped.empty(shape, np.float32)
-        for part, first in zip(parts, offsets, strict=False):
-            values[first : first + len(part)] = part[:]
-            if mapped is not None:
-                mapped.release()
+        for part, offset in zip(parts, offsets, strict=False):
+            for first in range(0, len(part), BLOCK_ROWS):
+                rows = part[first : first + BLOCK_ROWS]
+                values[offset + first : offset + first + len(rows)] = rows
+                if mapped is not None:
+                    mapped.release()
         return torch.from_numpy(values).to(device)
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)

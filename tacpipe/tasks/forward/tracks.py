@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
+from tacpipe.io.spill import MappedArrays
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
 from tacpipe.signals.runs import run_starts, window_starts
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
-    from tacpipe.io.spill import MappedArrays
 
 BLOCK_ROWS = 1 << 14  # rows per block
 _EXACT_BITS = 16  # bits of an integer that float32 represents exactly
@@ -72,26 +73,28 @@ class Levels:
         """Return the levels of the rows from ``first`` to ``last``, exclusive."""
         return Levels(self.stored[first:last], self.rest_counts, self.dtype)
 
-    def put_aside(self, mapped: MappedArrays) -> Levels:
-        """Return the same levels with their rows stored in ``mapped``."""
-        return Levels(mapped.keep(self.stored), self.rest_counts, self.dtype)
-
-    def finite(self) -> Bools:
-        """Return which rows (time,) contain only finite levels."""
+    def finite(self, storage: MappedArrays) -> Bools:
+        """Return which rows (time,) contain only finite levels; ``storage`` may contain the rows."""
         finite = np.ones(len(self), dtype=bool)
         for first in range(0, len(self), BLOCK_ROWS):
             block = slice(first, first + BLOCK_ROWS)
             finite[block] = np.isfinite(self.stored[block] - self.rest_counts).all(axis=1)
+            storage.release()
         return finite
 
 
-def above_rest(table: pa.Table | Columns, channels: Sequence[str]) -> Levels:
-    """Return the channels' levels above rest. Raises `TacpipeError` if a channel has no rest level."""
-    rest_counts = tactile.rest_counts(table.schema, channels)
-    narrow = all(_fits_float32(table.schema.field(name).type) for name in channels)
-    stored = np.empty((table.num_rows, len(channels)), np.float32 if narrow else np.float64)
-    for index, name in enumerate(channels):
-        stored[:, index] = table.column(name).to_numpy()
+def above_rest(columns: Columns, channels: Sequence[str], storage: MappedArrays) -> Levels:
+    """Return the channels' levels above rest, kept in ``storage``. Raises `TacpipeError` if a channel has no rest level."""
+    rest_counts = tactile.rest_counts(columns.schema, channels)
+    narrow = all(_fits_float32(columns.schema.field(name).type) for name in channels)
+    stored = storage.empty((columns.num_rows, len(channels)), np.float32 if narrow else np.float64)
+    first = 0
+    for batch in columns.batches(list(channels)):
+        rows = slice(first, first + batch.num_rows)
+        for index, name in enumerate(channels):
+            stored[rows, index] = batch.column(name).to_numpy()
+        storage.read(stored[rows].nbytes)
+        first = rows.stop
     return Levels(stored, rest_counts)
 
 
@@ -164,23 +167,6 @@ class Track:
                 selected[name] = getattr(self, name)[first:last]
         return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **selected)
 
-    def put_aside(self, mapped: MappedArrays) -> Track:
-        """Return the same track with its rows stored in ``mapped``."""
-        tactile = self.tactile.put_aside(mapped) if isinstance(self.tactile, Levels) else mapped.keep(self.tactile)
-        latent: AnyFloats | Levels
-        if not isinstance(self.latent, Levels):
-            latent = mapped.keep(self.latent)
-        elif isinstance(self.tactile, Levels) and self.latent.stored is self.tactile.stored:
-            assert isinstance(tactile, Levels)
-            latent = tactile.astype(self.latent.dtype)
-        else:
-            latent = self.latent.put_aside(mapped)
-        names = ("t_ns", "contact", "groups", "usable", "arm", "finger", "plan_velocity")
-        arrays: dict[str, Any] = {
-            name: mapped.keep(getattr(self, name)) for name in names if getattr(self, name) is not None
-        }
-        return replace(self, tactile=tactile, latent=latent, **arrays)
-
     def planned_arm(self, rows: Int64s) -> AnyFloats:
         """Return the arm at ``rows`` (…) as a plan contains it, (…, 13), with velocities from `plan_velocity`."""
         arm = self.arm[rows]
@@ -205,12 +191,12 @@ def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -
     return TacpipeError(f"{beginning} no window of {context} and {horizon} rows without a gap. {' '.join(advice)}")
 
 
-def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
+def codec_of(schema: pa.Schema, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:
     """Return the codec in a dataset's files, or the identity codec if there is none.
 
-    ``name`` is the name of the recording with this ``table``. Raises `TacpipeError` if table and files do not match.
+    ``name`` is the name of the recording with this ``schema``. Raises `TacpipeError` if schema and files do not match.
     """
-    latents = tactile.columns(table.schema, "latent")
+    latents = tactile.columns(schema, "latent")
     if codecs.DESCRIPTION in files:
         codec = codecs.load(files)
         if latents != codec.latents:
@@ -224,10 +210,10 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> cod
             f"The table has {len(latents)} latent columns but its dataset no {codecs.DESCRIPTION}. "
             "Give the output of `tacpipe compress` as it is."
         )
-    channels = tactile.columns(table.schema, "tactile")
+    channels = tactile.columns(schema, "tactile")
     if not channels:
-        raise missing_channel_error(name, "tactile", table.schema)
-    return codecs.Raw(channels, tuple(tactile.layout(table.schema, channels)))
+        raise missing_channel_error(name, "tactile", schema)
+    return codecs.Raw(channels, tuple(tactile.layout(schema, channels)))
 
 
 def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
@@ -235,16 +221,21 @@ def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
 
     Raises `TacpipeError` if a column is absent or belongs to the simulator's ground truth.
     """
+    _check_inputs(table.schema, names)
+    return tactile.matrix(table, names)
+
+
+def _check_inputs(schema: pa.Schema, names: Sequence[str]) -> None:
+    """Raise `TacpipeError` if a column is absent or belongs to the simulator's ground truth."""
     for name in names:
         if name.startswith(TRUTH):
             raise TacpipeError(f"{name} is the simulator's ground truth; a model that reads it has learned nothing.")
-        if name not in table.column_names:
+        if name not in schema.names:
             raise TacpipeError(
                 f"There is no column {name}. Give recordings of the same streams and columns as the model's, that went "
                 "through `tacpipe synchronize` and `tacpipe segment contacts`, and for a model of latents through "
                 "`tacpipe compress`."
             )
-    return tactile.matrix(table, names)
 
 
 def select_pose(shard: Recording, actions: str, arm: str = "") -> Pose:
@@ -265,54 +256,94 @@ def select_pose(shard: Recording, actions: str, arm: str = "") -> Pose:
     return pose
 
 
-def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.DEFAULT_POSE) -> Track:
+def track(
+    shard: Recording, codec: codecs.Codec, pose: Pose = poses.DEFAULT_POSE, storage: MappedArrays | None = None
+) -> Track:
     """Return a recording's track, with its stored latents, or its channels if ``codec`` is raw.
 
-    ``pose`` contains the names of the arm's columns. Without a position the arm does not move, and without a quaternion
-    it does not turn. Rows with a value that is not finite or in a gap of any stream are unusable. Raises `TacpipeError`
-    with the recording's name if a column is absent or its channels are not the codec's.
+    ``storage`` keeps the rows, by default in memory. ``pose`` contains the names of the arm's columns. Without a position
+    the arm does not move, and without a quaternion it does not turn. Rows with a value that is not finite or in a gap of
+    any stream are unusable. Raises `TacpipeError` with the recording's name if a column is absent or its channels are not
+    the codec's.
     """
-    table = shard.columns()
+    table, storage = shard.columns(), storage or MappedArrays(sys.maxsize)
     try:
         codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
-        counts_above_rest = above_rest(table, codec.channels)
-        finite = counts_above_rest.finite()
+        counts_above_rest = above_rest(table, codec.channels, storage)
+        finite = counts_above_rest.finite(storage)
         if codec.kind == "raw":
             latent: AnyFloats | Levels = counts_above_rest.astype(np.float32)
         else:
             read = inputs(table, codec.latents)
             finite &= np.isfinite(read).all(axis=1)
-            latent = read.astype(np.float32)
-        placed = np.hstack([_position(table, pose), _orientation(table, pose)])
+            latent = storage.keep(read.astype(np.float32))
+            del read
+        _check_inputs(table.schema, pose.columns)
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
+        arm, plan_velocity = _motion(table, pose, storage)
         finger = _finger_width(table)
         gaps, slips = tactile.gap_mask(table), slips_of(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
-    by_joints = _velocity_of_joints(table, pose, placed)
-    by_poses = kinematics.difference_velocity(t_ns, placed[:, :3], placed[:, 3:])
-    arm = np.hstack([placed, by_poses if by_joints is None else by_joints]).astype(np.float32)
-    plan_velocity = None if by_joints is None else by_poses.astype(np.float32)
-    del table, by_joints, by_poses
+    del table
     columns.release()
     finite &= np.isfinite(arm).all(axis=1)
     timeline = str(shard.attributes.get("grid", "uniform"))
     labelled_object = shard.attributes.get("object")
     return Track(
         shard.name,
-        t_ns,
-        contact,
-        np.cumsum(run_starts(t_ns, streams.max_step(shard.attributes))),
+        storage.keep(t_ns),
+        storage.keep(contact),
+        storage.keep(np.cumsum(run_starts(t_ns, streams.max_step(shard.attributes)))),
         finite & np.isfinite(finger) & ~gaps,
         latent,
         arm,
-        finger.astype(np.float32),
+        storage.keep(finger.astype(np.float32)),
         counts_above_rest,
         timeline,
         None if labelled_object is None else str(labelled_object),
         slips,
         plan_velocity,
     )
+
+
+def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloats, AnyFloats | None]:
+    """Return the arm (time, 13) and, if its velocities come from joints, those of a plan with its poses (time, 6).
+
+    Quaternions have unit length and continuous signs; those that cannot be normalised become NaN.
+    """
+    angles, speeds = _joints_that_carry_hand(table, pose)
+    count = table.num_rows
+    arm = storage.empty((count, len(ARM)), np.float32)
+    plan_velocity = storage.empty((count, len(ARM) - POSED), np.float32) if angles else None
+    signs = kinematics.SignContinuation()
+    before = slice(0, 0)  # the row before a batch
+    t_ns, placed = np.zeros(0, np.int64), np.zeros((0, POSED))
+    first = 0
+    for batch in table.batches(["t_ns", *pose.position, *pose.orientation, *angles, *speeds]):
+        rows = slice(first, first + batch.num_rows)
+        orientation = np.tile([0.0, 0.0, 0.0, 1.0], (batch.num_rows, 1))
+        if pose.orientation:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                stored = signs.apply(
+                    np.arange(rows.start, rows.stop), inputs(batch, pose.orientation).astype(np.float64, copy=False)
+                )
+                orientation = make_continuous(stored)
+        t_ns = np.concatenate([t_ns[before], whole_numbers(batch, "t_ns")])
+        placed = np.concatenate([placed[before], np.hstack([_position(batch, pose), orientation])])
+        by_poses = kinematics.difference_velocity(t_ns, placed[:, :3], placed[:, 3:])
+        before = slice(-1, None)
+        by_poses, batch_poses = by_poses[-batch.num_rows :], placed[-batch.num_rows :]
+        velocity = by_poses
+        if plan_velocity is not None:
+            plan_velocity[rows] = by_poses
+            velocity = kinematics.hand_velocity(
+                kinematics.PANDA, inputs(batch, angles), inputs(batch, speeds), batch_poses[:, :3]
+            )
+        arm[rows] = np.hstack([batch_poses, velocity])
+        storage.read(2 * arm[rows].nbytes)
+        first = rows.stop
+    return arm, plan_velocity
 
 
 def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
@@ -322,17 +353,6 @@ def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     position = inputs(table, pose.position)
     scale = np.array([poses.metres_per_unit(table.schema.field(name)) for name in pose.position])
     return position if (scale == 1.0).all() else position * scale
-
-
-def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
-    """Return unit quaternions (time, 4) with continuous signs; those that cannot be normalised become NaN.
-
-    Without a quaternion column, returns the identity.
-    """
-    if not pose.orientation:
-        return np.tile([0.0, 0.0, 0.0, 1.0], (table.num_rows, 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return make_continuous(inputs(table, pose.orientation).astype(np.float64))
 
 
 def _finger_width(table: pa.Table | Columns) -> AnyFloats:
@@ -351,14 +371,16 @@ def opening(schema: pa.Schema) -> str:
     return columns[0] if len(columns) == 1 else ""
 
 
-def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats) -> AnyFloats | None:
-    """Return the hand's linear and angular velocity (time, 6) from its joints, or None if the arm's model is unknown."""
+def _joints_that_carry_hand(table: Columns, pose: Pose) -> tuple[Sequence[str], Sequence[str]]:
+    """Return the columns of joint angles and speeds that move the hand, or empty tuples if the arm's model is unknown."""
     names, speeds = joints(table.schema, pose)
-    if len(names) == len(speeds) == JOINTS:
-        angles = inputs(table, names)
-        if kinematics.carries_hand(kinematics.PANDA, angles, placed[:, :3]):
-            return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), placed[:, :3])
-    return None
+    if not len(names) == len(speeds) == JOINTS:
+        return (), ()
+    tool_m = [
+        kinematics.tool_positions(kinematics.PANDA, inputs(batch, names), _position(batch, pose))
+        for batch in table.batches([*pose.position, *names])
+    ]
+    return (names, speeds) if kinematics.is_fixed(np.concatenate([np.zeros((0, 3)), *tool_m])) else ((), ())
 
 
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:

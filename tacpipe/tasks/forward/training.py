@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from tacpipe.io import terminal
 from tacpipe.io.spill import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.forecasts import Shrunk, persistence_weights
-from tacpipe.models.linear import FittedBaselines
+from tacpipe.models.linear import CHUNK, FittedBaselines, Windows
 from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks.forward import headline, networks, tracks
@@ -42,7 +42,7 @@ from tacpipe.tasks.forward.forecaster import (
     layout,
 )
 from tacpipe.tasks.forward.headline import look_ahead_notes
-from tacpipe.tasks.forward.networks import Rows, rows_of_tracks, with_actions
+from tacpipe.tasks.forward.networks import Rows, WindowLevels, rows_of_tracks, with_actions
 from tacpipe.tasks.forward.params import (
     AlarmLevels,
     CodecDescription,
@@ -53,7 +53,7 @@ from tacpipe.tasks.forward.params import (
     Params,
 )
 from tacpipe.tasks.forward.predictors import iterate_predictions
-from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.tracks import BLOCK_ROWS, Track
 from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
 from tacpipe.training.following import history_bytes
@@ -64,7 +64,6 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost all rows are used
-BLOCK_ROWS = 1 << 14  # rows per block
 IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk
 LINEAR = 20_000  # windows for fitting the linear baselines
 SHRINKING = 3000  # maximum number of evenly spaced validation windows for fitting the weights of the forecast
@@ -86,9 +85,10 @@ def train(
     if not training.recordings:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     first = next(iter(training.recordings.values()))
-    codec = tracks.codec_of(first.table(), training.files, first.name)
+    schema = first.columns().schema
+    codec = tracks.codec_of(schema, training.files, first.name)
     pose = tracks.select_pose(first, params.actions, params.arm)
-    unit = headline.unit_of_channels(first.table().schema, codec.channels)
+    unit = headline.unit_of_channels(schema, codec.channels)
     start = Forecaster.load(init) if init else None
     changes = codec.representation == INCREMENTS
     params = params.resolved(layout(codec), start.params if start else None, changes=changes)
@@ -97,13 +97,13 @@ def train(
         _check_pose(start, pose)
     mapped = MappedArrays(IN_MEMORY)
     parts = [
-        [tracks.track(shard, codec, pose).put_aside(mapped) for _, shard in sorted(dataset.recordings.items())]
+        [tracks.track(shard, codec, pose, mapped) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([track for part in parts for track in part])
     if rate_hz:
         terminal.report_progress(f"a step is {1e3 / rate_hz:.4g} ms")
-    reference = start.orientation if start else _reference(track.arm[track.usable, 3:7] for track in parts[0])
+    reference = start.orientation if start else _reference(parts[0])
     parts = [[_align_quaternions(track, reference, mapped) for track in part] for part in parts]
     device = devices.kind()
     training_rows, validation_rows = (
@@ -112,7 +112,7 @@ def train(
     for role, dataset, windows in (("training", training, training_rows), ("validation", validation, validation_rows)):
         if not len(windows.starts):
             raise tracks.no_window(f"The {role} recordings contain", dataset, params.context, params.horizon)
-    _check_channels(codec, parts[0])
+    _check_channels(codec, parts[0], mapped)
     build = partial(_built, params, codec, training_rows, start, device)
     schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)
     trained = loop.train(
@@ -269,18 +269,23 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str, ma
     return rows_of_tracks(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
 
 
-def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
+def _linear(part: Rows) -> Windows:
     """Return past touch (window, context, channel), motion (window, row, 12) and future touch, for the baselines."""
     starts = part.evenly_spread(LINEAR)
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
-    moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
-    return part.tactile(past), moved, part.tactile(ahead)
+    moved = [
+        motion(part.pick(starts[first : first + CHUNK])[0])[0].transpose(0, 1).cpu().numpy()
+        for first in range(0, len(starts), CHUNK)
+    ]
+    return WindowLevels(part, past), np.concatenate(moved), WindowLevels(part, ahead)
 
 
-def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
+def _check_channels(codec: codecs.Codec, part: Sequence[Track], mapped: MappedArrays) -> None:
     """Raise an error if no channel of the training recordings ever changes, because there is nothing to predict."""
-    if any(track.usable.any() for track in part) and all(not track.tactile[track.usable].any() for track in part):
+    if any(track.usable.any() for track in part) and not any(
+        track.tactile[usable].any() for track, usable in _usable(part, mapped)
+    ):
         raise TacpipeError(
             f"None of the {len(codec.channels)} tactile channels ever moves in {len(part)} training recordings. "
             "Check the sensor, and that the recordings hold contact."
@@ -314,7 +319,7 @@ def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track
         rows = np.flatnonzero(track.usable)
         for first in range(0, len(rows), BLOCK_ROWS):
             yield track, rows[first : first + BLOCK_ROWS]
-        mapped.release()
+            mapped.release()
 
 
 def _add_rows(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
@@ -332,9 +337,13 @@ def _describe_codec(codec: codecs.Codec) -> CodecDescription:
     return {"kind": codec.kind, "of": codec.representation, "frames": frames, "latents": latents, "name": name}
 
 
-def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
+def _reference(part: Sequence[Track]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,), the reference for the signs of all others."""
-    return next((rows[0].astype(np.float64) for rows in quaternions if len(rows)), np.array([0.0, 0.0, 0.0, 1.0]))
+    for track in part:
+        if track.usable.any():
+            quaternion: AnyFloats = track.arm[track.usable.argmax(), tracks.TURNED].astype(np.float64)
+            return quaternion
+    return np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def _check_start(

@@ -48,7 +48,7 @@ def test_a_window_has_the_first_name_that_fits(changed: dict[str, float], situat
 
 def test_windows_of_a_recording_are_named_by_their_last_row_and_those_to_come() -> None:
     recording = motion(0)
-    track = tracks.track(recording, tracks.codec_of(recording.content, {}))  # type: ignore[arg-type]
+    track = tracks.track(recording, tracks.codec_of(recording.content.schema, {}))  # type: ignore[arg-type]
     rows = len(track.t_ns)
     arm = np.zeros((rows, 13), np.float32)
     arm[40:, 7] = 0.5

@@ -184,9 +184,9 @@ def test_tables_and_codecs_that_do_not_belong_together_are_refused() -> None:
     bare = table(TACTILE)
     latent = bare.append_column(bare.schema.field(0).with_name("z00").with_metadata({"quantity": "latent"}), bare[0])
     with pytest.raises(TacpipeError, match="1 latent columns but its dataset no codec"):
-        tracks.codec_of(latent, {})
+        tracks.codec_of(latent.schema, {})
     with pytest.raises(TacpipeError, match="quantity tactile"):
-        tracks.codec_of(bare.select(["t_ns"]), {})
+        tracks.codec_of(bare.select(["t_ns"]).schema, {})
     reversed_codec = codecs.Raw(tuple(reversed(CHANNELS)), ())
     with pytest.raises(TacpipeError, match="trial: The codec does not fit"):
         tracks.track(FakeShard("trial", bare), reversed_codec)  # type: ignore[arg-type]

@@ -12,9 +12,10 @@ from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import spill
+from tacpipe.io.columns import Columns
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
-from tacpipe.tasks.forward import training
+from tacpipe.tasks.forward import networks, training
 from tacpipe.tasks.forward import training as forward_training
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
@@ -67,7 +68,10 @@ def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
 
     in_memory = model("in-memory")
     monkeypatch.setattr(training, "IN_MEMORY", 0)
-    monkeypatch.setattr(training, "BLOCK_ROWS", 7)
+    for module in (training, networks):
+        monkeypatch.setattr(module, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(networks, "WINDOWS", 5)
+    monkeypatch.setattr(Columns.batches, "__defaults__", (None, 7))
     monkeypatch.setattr(spill, "SEGMENT_BYTES", 1 << 14)
     monkeypatch.setattr(spill, "MAX_READ_BYTES", 0)
     assert model("on-disk") == in_memory

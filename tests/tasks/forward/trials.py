@@ -54,7 +54,7 @@ def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, rep
 def track(content: pa.Table, name: str = "trial", **attributes: Any) -> tracks.Track:
     """The track of a table."""
     shard: Any = FakeShard(name, content, attributes)
-    return tracks.track(shard, tracks.codec_of(content, {}))
+    return tracks.track(shard, tracks.codec_of(content.schema, {}))
 
 
 def evaluated(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
@@ -103,7 +103,7 @@ def panda(rows: int = 60) -> tuple[AnyFloats, dict[str, AnyFloats]]:
 
 def raw() -> codecs.Codec:
     """The codec of recordings that have none."""
-    return tracks.codec_of(motion(0).content, {})
+    return tracks.codec_of(motion(0).content.schema, {})
 
 
 __all__ = ["CHANNELS", "FakeShard", "dataset", "motion", "table"]
