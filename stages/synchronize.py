@@ -10,7 +10,7 @@ Example: tacpipe synchronize data/recordings -o data/synced
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -120,7 +120,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         attributes["not_synchronized"] = streams.join_names(omitted)
     attributes["grid_rate_hz"] = round(mean_rate_hz(grid_ns), 3) if params.rate_hz is None else params.rate_hz
     if len(grid_ns) > 1:
-        attributes["step_ms"] = round(median_step_ns(grid_ns) / 1e6, 3)
+        attributes["step_ms"] = round(median_step_ns(grid_ns, storage.release) / 1e6, 3)
     ahead_ns = storage.empty((0 if hold_values else len(grid_ns),), grid_ns.dtype)  # (grid,)
     ahead_ns[:] = 0
     gaps: dict[str, pa.Array] = {}  # masks (grid,) by name
@@ -130,7 +130,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         if params.unwrap:
             stream = streams.unwrap_counts(stream)
             attributes |= {f"{name}_wrapped_channels": len(stream.wraps)} if stream.wraps else {}
-        gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
+        gap_ns = default_gap_ns(stream.t_ns, storage.release) if params.gap_ms is None else round(params.gap_ms * 1e6)
         readers.append(GridColumns(stream, grid_ns, exact, gap_ns, storage, hold_values=hold_values))
         if not stream.truth:
             gaps[name + masks.GAP] = to_arrow(readers[-1].gaps())
@@ -145,18 +145,16 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max(initial=0)) / 1e6, 3)
     times = master.columns.schema.field("t_ns")
 
-    def batches(ranges: Sequence[slice]) -> Iterator[pa.RecordBatch]:
-        for points in ranges:
+    def batches() -> Iterator[pa.RecordBatch]:
+        for points in grid_ranges(grid_ns, list(placed.values()), BLOCK_BYTES):
             columns = [(times, grid_ns[points]), *(column for reader in readers for column in reader.read(points))]
             arrays = [to_arrow(values, kind.type) if hasattr(values, "dtype") else values for kind, values in columns]
             yield pa.RecordBatch.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
             storage.release()
 
-    storage.release()
-    ranges = list(grid_ranges(grid_ns, list(placed.values()), BLOCK_BYTES))
-    following = batches(ranges)
-    first = next(following)
+    following = batches()
+    first, second = next(following), next(following, None)
     result = pa.Table.from_batches([first])
-    if len(ranges) > 1:
-        result = pa.RecordBatchReader.from_batches(first.schema, chain([first], following))
+    if second is not None:
+        result = pa.RecordBatchReader.from_batches(first.schema, chain([first, second], following))
     return RecordingOutput(result, attributes, masks.describe_gaps(pa.Table.from_pydict(gaps)))

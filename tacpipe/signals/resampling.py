@@ -7,6 +7,8 @@ signal is constant; `in_gap` marks these points.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
@@ -155,27 +157,36 @@ def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -
     return medians
 
 
-def default_gap_ns(t_ns: Times) -> int:
+def _do_nothing() -> None:
+    pass
+
+
+def default_gap_ns(t_ns: Times, release: Callable[[], None] = _do_nothing) -> int:
     """Return the longest time between two samples without a gap: 50 ms, or 2.5 median periods below 20 Hz.
+
+    ``release`` is called after each part of ``t_ns`` that was read.
 
     >>> default_gap_ns(np.arange(5) * 10_000_000), default_gap_ns(np.arange(5) * 73_000_000)
     (50000000, 182500000)
     """
-    period_ns = median_step_ns(t_ns)
+    period_ns = median_step_ns(t_ns, release)
     return GAP_NS if period_ns <= GAP_NS else round(GAP_PERIODS * period_ns)
 
 
-def median_step_ns(t_ns: Times) -> float:
-    """Return the median time between two samples, or 0 for fewer than two. Times must not decrease."""
+def median_step_ns(t_ns: Times, release: Callable[[], None] = _do_nothing) -> float:
+    """Return the median time between two samples, or 0 for fewer than two. Times must not decrease.
+
+    ``release`` is called after each part of ``t_ns`` that was read.
+    """
     steps = len(t_ns) - 1
     if steps < 1:
         return 0.0
     if steps <= STEPS_AT_ONCE:
         return float(np.median(np.diff(t_ns)))
-    return (_ranked_step_ns(t_ns, (steps - 1) // 2) + _ranked_step_ns(t_ns, steps // 2)) / 2
+    return (_ranked_step_ns(t_ns, (steps - 1) // 2, release) + _ranked_step_ns(t_ns, steps // 2, release)) / 2
 
 
-def _ranked_step_ns(t_ns: Times, rank: int) -> int:
+def _ranked_step_ns(t_ns: Times, rank: int, release: Callable[[], None]) -> int:
     """Return the step between samples that has ``rank`` if steps are sorted; those above 4 hours count as 4 hours.
 
     Steps are counted by their upper half and then by their lower half, so that they are not in memory at once.
@@ -189,6 +200,7 @@ def _ranked_step_ns(t_ns: Times, rank: int) -> int:
             if not shift:
                 steps_ns = steps_ns[steps_ns >> HALF_BITS == upper]
             counts += np.bincount(steps_ns >> shift & half - 1, minlength=half)
+            release()
         part = int(np.searchsorted(np.cumsum(counts), rank, side="right"))
         rank -= int(counts[:part].sum())
         if shift:

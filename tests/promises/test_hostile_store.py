@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 import tacpipe
-from tacpipe.datasets.manifest import parse
+from tacpipe.datasets.manifest import stored
+from tacpipe.datasets.pages import Item
 from tacpipe.errors import DAMAGED, DONE, FAILED, USAGE, DamagedError, TacpipeError
 from tacpipe.io.hashing import digest
 from tacpipe.store.store import MissingError, Store
@@ -200,20 +201,24 @@ def test_a_record_that_was_made_up_is_not_taken_over(lab: Lab, remote: Store) ->
 
 def test_what_a_manifest_declares_to_be_larger_than_the_disk_is_not_begun(lab: Lab, remote: Store) -> None:
     (root,) = remote.roots.all()
-    value = json.loads(remote.read(root["manifest"]))
-    for entry in value["recordings"].values():
-        entry["shards"][""]["bytes"] = 10**18
-    changed = remote.put(json.dumps(value).encode())
-    remote.roots.write({**root, "manifest": changed.digest})
+    manifest = stored(remote, root["manifest"])
+
+    def declare(size: int, *names: str) -> None:
+        """Push a manifest in which shards of recordings have another size."""
+        entries = {name: manifest.recordings[name] for name in names}
+        items = {
+            name: Item({**entry, "shards": {"": {**entry["shards"][""], "bytes": size}}})
+            for name, entry in entries.items()
+        }
+        remote.roots.write({**root, "manifest": manifest.with_recordings(items).keep(remote).digest})
+
+    declare(10**18, *manifest.recordings)
     failed = lab.call(f"store pull {remote.root} data/r")
     assert failed.code == FAILED and "2,000,000,000.0 GB are to be copied" in failed.err
-    value["recordings"]["trial-000"]["shards"][""]["bytes"] = 10**6
-    value["recordings"]["trial-001"]["shards"][""]["bytes"] = 10**6
-    changed = remote.put(json.dumps(value).encode())
-    remote.roots.write({**root, "manifest": changed.digest})
+    declare(10**6, *manifest.recordings)
     failed = lab.call(f"store pull {remote.root} data/r")
     assert failed.code == DAMAGED and "its manifest declares 1,000,000" in failed.err
-    assert parse(Path("../data/r/manifest.json").read_bytes(), "mine").rows == 6
+    assert lab.manifest("data/r").rows == 6
 
 
 def test_an_object_is_read_up_to_what_is_declared_and_a_little_one_that_grew_is_quarantined(tmp_path: Path) -> None:
