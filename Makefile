@@ -26,6 +26,7 @@ CALLS := 3
 SLOW := 1/1
 TARGETS :=
 FAULTS :=
+PAGED := tests/promises tests/stores $(patsubst %,tests/test_%.py,api cli dataset garbage keys labels lineage pages pipeline presence previous replacing run show splits store thousand transfer)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -q -n auto --dist worksteal
 COUNTED := TACPIPE_COUNTS=$(CURDIR)/$(COUNTS) $(PYTEST)
 # thousands of small projects come and go: in memory, where there are 4 GB of it, no disk delays them
@@ -54,7 +55,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-paged test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -115,6 +116,9 @@ test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, i
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
 	@$(EXHAUSTIVE) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
+
+test-paged: $(VENV)/.dev ## run the tests of stores and datasets with every dataset of two recordings or more divided into pages
+	@PYTHONPATH=tests/paged $(PYTEST) -m "not faults and not long and not rig" $(PAGED)
 
 test-slurm: $(VENV)/.dev ## start Slurm on this computer, as root, and put the questions of all executors to its jobs
 	@if ! command -v slurmctld > /dev/null; then $(call debian,$(SLURM)); fi
