@@ -111,7 +111,11 @@ class GridColumns:
 def _channels(
     stream: TimedStream, grid_ns: Times, exact: Int64s | None, signs: dict[str, SignContinuation]
 ) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, in the order of the stream."""
+    """Return field and values of each channel on the grid, in the order of the stream.
+
+    ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated. ``signs`` continues
+    those of quaternions, by interpolation. Raises `TacpipeError` if a quaternion lacks a component.
+    """
     from tacpipe.signals.kinematics import SignContinuation
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
@@ -171,7 +175,10 @@ def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolatio
 def _interpolate_samples(
     stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any, signs: SignContinuation
 ) -> Floats:
-    """Interpolate channels (grid, channel) from the rows ``used``; ``signs`` are those of a quaternion."""
+    """Return the values of channels at grid points (grid, channel), interpolated from the rows ``used``.
+
+    ``signs`` continues those of a quaternion.
+    """
     import numpy as np
 
     from tacpipe.signals.resampling import linear, median_around, slerp
@@ -192,7 +199,10 @@ def _to_column(kind: pa.Field, column: Floats) -> GridColumn:
 
 
 def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample."""
+    """Return masks of repeated nearest samples and of gaps, and the distance to the nearest sample in ns.
+
+    ``exact`` are the rows whose times are the grid points, or None.
+    """
     import numpy as np
 
     from tacpipe.signals.resampling import nearest_rows
@@ -203,7 +213,10 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
 
 
 def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
-    """Return the time (grid,) from each point to the arrival of the last sample that is used for it, at least 0."""
+    """Return the time (grid,) in ns from each point to the arrival of the last sample that is used for it.
+
+    It is 0 if that sample arrived before.
+    """
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
@@ -215,7 +228,7 @@ def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) ->
 
 
 def _online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample."""
+    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample in ns."""
     from tacpipe.signals.resampling import newest_rows
 
     rows = newest_rows(stream.t_ns, grid_ns)

@@ -25,7 +25,6 @@ DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a 
 # column of the recorder with the maximum delay of each arrival time; not a channel
 UNCERTAIN = "t_uncertain_ns"
 NOT_INTERPOLATED = ("label", "time", "mask")  # quantities whose nearest sample is used
-TURN = 1 << 16  # counts between two wraps
 POINTS = 1 << 18  # number of times that are compared at once
 
 
@@ -108,8 +107,10 @@ class Wraps(NamedTuple):
         """Return ``counts`` (time,) of the rows from ``first`` as int32 without wraps."""
         import numpy as np
 
+        from tacpipe.signals.repairs import RANGE
+
         turns = self.turns[self.rows.searchsorted(np.arange(first, first + len(counts)), side="right")]
-        return np.asarray(counts.astype(np.int32) + TURN * turns, dtype=np.int32)
+        return np.asarray(counts.astype(np.int32) + RANGE * turns, dtype=np.int32)
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def may_be_signal(schema: pa.Schema) -> bool:
 
 
 def to_host_clock(recording: str, name: str, columns: Columns, clock: str, storage: MappedArrays) -> TimedStream:
-    """Convert a stream to the host's clock. ``clock`` selects the times: device, arrival or auto.
+    """Return a stream with times on the host's clock. ``clock`` selects the times: device, arrival or auto.
 
     Times and repeats are kept in ``storage``. Raises `TacpipeError` if times are missing or decrease, or the device's clock
     cannot be fitted.
@@ -393,8 +394,8 @@ def grid(
         points += len(chosen)
         storage.read(4 * block_ns.nbytes)
     if not points:
-        late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
-        early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
+        latest = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
+        earliest = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
             f"Recording {recording}: no row of {master.name} is within the time range of all streams. Stream {latest.name} "
             f"starts last, at {printable.moment(int(latest.t_ns[0]))}, and {earliest.name} ends first, at "
