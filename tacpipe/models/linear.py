@@ -52,7 +52,8 @@ class WindowArray(Protocol):
         """Return some of the windows."""
 
 
-Windows = tuple[WindowArray, WindowArray, WindowArray]  # past, motion and ahead
+Windows = tuple[AnyFloats, AnyFloats, AnyFloats]  # past, motion and ahead
+WindowArrays = tuple[WindowArray, WindowArray, WindowArray]
 
 NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions")
 ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # for standardised features and sums over windows, as in scikit-learn
@@ -101,7 +102,7 @@ class FittedBaselines:
     ridge_actions: AffineMap
 
     @classmethod
-    def fit(cls, training: Windows, validation: Windows) -> FittedBaselines:
+    def fit(cls, training: WindowArrays, validation: WindowArrays) -> FittedBaselines:
         """Fit the baselines on ``training``, a tuple (past, motion, ahead); the alphas are chosen on ``validation``.
 
         Raises `TacpipeError` if a part has no windows, shapes do not match or a value is not finite.
@@ -210,7 +211,7 @@ class _FeatureSums:
     xy: AnyFloats  # (feature, step x channel)
 
     @classmethod
-    def accumulate(cls, part: Windows, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
+    def accumulate(cls, part: WindowArrays, centre: AnyFloats, bias: AnyFloats) -> _FeatureSums:
         """Return the sums over ``part`` of features, relative to ``centre``, and increments, relative to ``bias``.
 
         Raises `TacpipeError` if a value is not finite.
@@ -328,7 +329,7 @@ def _mean(arrays: WindowArray) -> AnyFloats:
     return total / len(arrays)
 
 
-def _validate_windows(name: str, part: Windows) -> None:
+def _validate_windows(name: str, part: WindowArrays) -> None:
     """Raise `TacpipeError` if the windows ``name`` are empty or their shapes do not match."""
     past, motion, ahead = part
     if not len(past):
@@ -349,5 +350,5 @@ def _validate_windows(name: str, part: Windows) -> None:
         )
 
 
-def _shapes(part: Windows) -> str:
+def _shapes(part: WindowArrays) -> str:
     return ", ".join(str(arrays.shape) for arrays in part)

@@ -26,7 +26,7 @@ from tacpipe.io import terminal
 from tacpipe.io.spill import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.forecasts import Shrunk, persistence_weights
-from tacpipe.models.linear import CHUNK, FittedBaselines, Windows
+from tacpipe.models.linear import CHUNK, FittedBaselines, WindowArrays
 from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks.forward import headline, networks, tracks
@@ -269,7 +269,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str, ma
     return rows_of_tracks(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
 
 
-def _linear(part: Rows) -> Windows:
+def _linear(part: Rows) -> WindowArrays:
     """Return past touch (window, context, channel), motion (window, row, 12) and future touch, for the baselines."""
     starts = part.evenly_spread(LINEAR)
     at = starts.cpu().numpy()[:, None]
