@@ -80,7 +80,7 @@ def test_a_long_recording_that_is_read_in_blocks_gives_the_rows_of_one_block(
         arm = arm.set_column(place, arm.schema.field(place), pa.array(component))
     readings = np.random.default_rng(3).integers(0, 999, 160)
     near = schema.stream(
-        T0 + np.arange(-3, 397, 2.5) * MS,
+        T0 + np.arange(-30, 3970, 25) * (MS // 10),
         [readings],
         [pa.field("near", pa.uint16(), metadata={"quantity": "proximity"})],
     )
