@@ -17,7 +17,7 @@ from scipy.integrate import quad
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
-from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.arrays import AnyFloats, Floats, Int64s
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.headline import MIN_CLUSTERS
 from tacpipe.metrics.intervals import wilson
@@ -253,22 +253,25 @@ BASELINE_AREA = 0.6
 
 
 def draw_scores(rng: np.random.Generator, objects: int, models: Sequence[ScoreModel]) -> list[list[ScoredTrack]]:
-    """Return the recordings of some objects with the scores of each model, which share a part of each object."""
+    """Return the windows of each object with the scores of each model. The models share a part of each object's score."""
     tracks: list[list[ScoredTrack]] = [[] for _ in models]
     for number in range(objects):
         shared = rng.standard_normal()
         own = rng.standard_normal((len(models), 2))
-        for recording in range(1 + rng.poisson(RECORDINGS - 1)):
-            slips = rng.random() < SLIP_SHARE
-            states = np.array([STABLE] * STABLE_ROWS + [BEFORE if slips else STABLE] * SLIP_ROWS)
-            t_ns = np.arange(len(states)) * 100_000_000
-            events = np.array([[t_ns[-1]] * 2] if slips else [], np.int64).reshape(-1, 2)
-            for part, model, (level, effect) in zip(tracks, models, own, strict=True):
-                scores = model.object_sd * (shared + level) / np.sqrt(2) + model.recording_sd * rng.standard_normal()
-                scores = scores + model.window_sd * rng.standard_normal(len(states))
-                scores = scores + (states == BEFORE) * (model.effect + model.effect_sd * effect)
-                name, weights = f"{number}-{recording}", np.ones(len(states))
-                part.append(ScoredTrack(name, str(number), t_ns, states, scores, events, weights, t_ns / 1e9))
+        states: list[Int64s] = []
+        scores: list[list[Floats]] = [[] for _ in models]
+        for _ in range(1 + rng.poisson(RECORDINGS - 1)):
+            state = BEFORE if rng.random() < SLIP_SHARE else STABLE
+            states.append(np.array([STABLE] * STABLE_ROWS + [state] * SLIP_ROWS))
+            for part, model, (level, effect) in zip(scores, models, own, strict=True):
+                values = model.object_sd * (shared + level) / np.sqrt(2) + model.recording_sd * rng.standard_normal()
+                values = values + model.window_sd * rng.standard_normal(len(states[-1]))
+                part.append(values + (states[-1] == BEFORE) * (model.effect + model.effect_sd * effect))
+        all_states = np.concatenate(states)
+        t_ns, no_event = np.arange(len(all_states)) * 100_000_000, np.zeros((0, 2), np.int64)
+        for part, values_of_object in zip(tracks, scores, strict=True):
+            joined, weights = np.concatenate(values_of_object), np.ones(len(all_states))
+            part.append(ScoredTrack(str(number), str(number), t_ns, all_states, joined, no_event, weights, t_ns / 1e9))
     return tracks
 
 
@@ -279,8 +282,9 @@ def area_coverage(objects: int, area: float, repeats: int = REPEATS) -> AreaCove
     covered = np.full((repeats, 3), np.nan)
     for repeat in range(repeats):
         model, baseline = (slip.WindowScores(tracks) for tracks in draw_scores(rng, objects, models))
-        low, high = np.nanquantile(model.area("before").selected(draws), [0.025, 0.975])
-        ends = slip.areas(model)["before"], slip.margin(model, baseline)
+        area_of_model = model.area("before")
+        low, high = np.nanquantile(area_of_model.selected(draws), [0.025, 0.975])
+        ends = slip.area_estimate(area_of_model), slip.margin(model, baseline)
         truths = area, area - BASELINE_AREA
         covered[repeat, 0] = low <= area <= high
         for column, (estimate, truth) in enumerate(zip(ends, truths, strict=True), start=1):

@@ -7,6 +7,7 @@ results are those of the folds of ``train slip`` and ``evaluate``. The script pr
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import tacpipe
+from tacpipe.arrays import Floats, Times
 from tacpipe.datasets.dataset import Recording
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
@@ -32,17 +34,14 @@ CONTRASTS = {  # windows before a slip of these handlings, against stable contac
 def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterator[str]:
     """Yield the lines of the tables."""
     recordings = tacpipe.open(data).recordings
-    parts = [EvaluatedSlips.from_files(tacpipe.open(path).files) for path in results]
+    parts = [EvaluatedSlips.from_result(tacpipe.open(path)) for path in results]
     pooled = parts[0].pooled(parts[1:])
     handling = {name: str(recording.attributes["handling"]) for name, recording in recordings.items()}
     yield "| windows | before the slip | during the slip | time only, before |"
     yield "| --- | --- | --- | --- |"
     for name, (slips, stable) in CONTRASTS.items():
-        chosen = [number for number, track in enumerate(pooled.tracks) if handling[track.name] in (*slips, *stable)]
-        areas = [
-            metrics.areas(metrics.WindowScores([pooled.scored_by(predictor)[number] for number in chosen]))
-            for predictor in (MODEL, "time_only")
-        ]
+        chosen = select(pooled, [handling[track.name] in (*slips, *stable) for track in pooled.tracks])
+        areas = [metrics.areas(metrics.WindowScores(chosen.scored_by(predictor))) for predictor in (MODEL, "time_only")]
         cells = [areas[0]["before"], areas[0]["during"], areas[1]["before"]]
         yield f"| {name} | " + " | ".join(map(estimate_text, cells)) + " |"
     yield ""
@@ -66,6 +65,17 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
             if handling[track.name] == "release"
         ]
         yield f"At level {rate}, {sum(alarms)} of {len(alarms)} releases have an alarm while the gripper opens."
+
+
+def select(evaluated: EvaluatedSlips, chosen: Sequence[bool]) -> EvaluatedSlips:
+    """Return the evaluation of some recordings, matched for time again."""
+
+    def chosen_parts(parts: Mapping[str, tuple[Floats, ...]]) -> dict[str, tuple[Floats, ...]]:
+        return {name: tuple(itertools.compress(values, chosen)) for name, values in parts.items()}
+
+    tracks = tuple(itertools.compress(evaluated.tracks, chosen))
+    scores, probabilities = chosen_parts(evaluated.scores), chosen_parts(evaluated.probabilities)
+    return EvaluatedSlips(tracks, scores, probabilities, evaluated.levels).pooled([])
 
 
 def estimate_text(estimate: metrics.ObjectEstimate) -> str:
@@ -102,6 +112,7 @@ SHOWN = {  # handling -> title of its column
     "release": "the gripper opens",
 }
 BEFORE_S, AFTER_S = 2.0, 0.6  # time that the picture shows around an event
+GRASPED_S = 2.1  # latest time at which the grip is complete
 BLUE, GREY, RED = "#1f6feb", "#6e7781", "#cf222e"
 
 
@@ -113,7 +124,7 @@ def draw(path: Path, data: Path, models: Sequence[Path], results: Sequence[Path]
     from matplotlib import pyplot
 
     recordings = tacpipe.open(data).recordings
-    parts = [EvaluatedSlips.from_files(tacpipe.open(result).files) for result in results]
+    parts = [EvaluatedSlips.from_result(tacpipe.open(result)) for result in results]
     figure, grid = pyplot.subplots(3, len(SHOWN), figsize=(13, 6.5), sharex=True, sharey="row", layout="constrained")
     for column, (kind, title) in enumerate(SHOWN.items()):
         fold, name = next(
@@ -121,6 +132,7 @@ def draw(path: Path, data: Path, models: Sequence[Path], results: Sequence[Path]
             for fold, part in enumerate(parts)
             for track in part.tracks
             if recordings[track.name].attributes["handling"] == kind
+            and event_is_late(friction_in_use(recordings[track.name]))
         )
         recording, model = recordings[name], tacpipe.load(models[fold])
         event_ns, truth_ns, used = friction_in_use(recording)
@@ -153,7 +165,13 @@ def draw(path: Path, data: Path, models: Sequence[Path], results: Sequence[Path]
     pyplot.close(figure)
 
 
-def friction_in_use(recording: Recording) -> tuple[int, np.ndarray, np.ndarray]:
+def event_is_late(course: tuple[int, Times, Floats]) -> bool:
+    """Return whether the picture shows only the grasp before an event, and not the closing of the fingers."""
+    event_ns, truth_ns, _ = course
+    return (event_ns - int(truth_ns[0])) / 1e9 > GRASPED_S + BEFORE_S
+
+
+def friction_in_use(recording: Recording) -> tuple[int, Times, Floats]:
     """Return the time of the event, and times and load as a fraction of the friction limit, from the ground truth.
 
     The event is the start of the slip or of the release, or else the largest fraction.

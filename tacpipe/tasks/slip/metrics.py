@@ -218,8 +218,12 @@ def _rounded(value: float, low: float, high: float) -> ObjectEstimate:
 
 def areas(windows: WindowScores) -> dict[str, ObjectEstimate]:
     """Return the area under the curve of each part, with intervals over objects."""
-    by_part = {name: windows.area(name) for name in PARTS}
-    return {name: estimate(area.value, area.without, area.effective, is_share=True) for name, area in by_part.items()}
+    return {name: area_estimate(windows.area(name)) for name in PARTS}
+
+
+def area_estimate(area: Area) -> ObjectEstimate:
+    """Return an area under the curve with its interval over objects."""
+    return estimate(area.value, area.without, area.effective, is_share=True)
 
 
 def margin(model: WindowScores, baseline: WindowScores, name: str = "before") -> ObjectEstimate:

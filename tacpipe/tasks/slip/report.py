@@ -26,7 +26,7 @@ ALARM_HEADS = {
 }
 NOTE = (
     "Windows of stable contact are weighted to have the same times since the start as windows before or during a slip. "
-    "Intervals resample objects. The windows 2 to 3 s before a slip and those within recordings are controls: a model of "
+    "Intervals are over objects. The windows 2 to 3 s before a slip and those within recordings are controls: a model of "
     "the weak grasp is good at the first, poor at the second."
 )
 
