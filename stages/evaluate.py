@@ -42,7 +42,7 @@ def _is_live(params: Params) -> bool:
     return params.live
 
 
-@stage(version=7, headline=headline.FILE, as_given=_is_live)
+@stage(version=8, headline=headline.FILE, as_given=_is_live)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings with the metrics of its task."""
     from tacpipe.datasets import model_files

@@ -21,7 +21,7 @@ from tacpipe.printable import excerpt, listed, plain
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
-    "live": "Forecast while a rig is recorded, with alarms.",
+    "live": "Predict while a rig is recorded.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show the content of a dataset, split, model or result.",
     "compare": "Compare results: the best first, columns for what differs.",

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,7 +37,7 @@ Example: tacpipe live rig.toml --model models/calibrated --quantiles 10,90   # f
 
 Example: tacpipe live rig.toml --model models/forward --realtime   # on a busy computer
 
-Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alarms-on data/segments --split data/split"""
+Example: tacpipe live rig.toml --model models/slip --plan udp::9000 --alarms-per-minute 1"""
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -172,9 +170,6 @@ def _run(
         RigView(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(is_over)
-        if plan is not None and supervisor.alarms and supervisor.alarms["levels"]:
-            levels = json.dumps(supervisor.alarms, separators=(",", ":"))
-            plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
             _run_unrecorded(recorder, duration_s, view, is_over)
             lost = recorder.lost()
@@ -224,7 +219,6 @@ def _report(
             "output": None if output is None else str(output),
             "recordings": [asdict(recording) for recording in recorded],
             "live": figures,
-            "alarm_levels": supervisor.alarms or {},
         }
         error = {} if failed is None else {"error": str(failed), "exit_code": failed.exit_code}
         terminal.result_json({**value, **error})

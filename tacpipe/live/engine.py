@@ -92,10 +92,6 @@ class Engine(ABC):
         if self._offset_ns is not None and message.answers:
             message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
-    def alarm_levels(self) -> wire.AlarmsJson | None:
-        """Return the levels of the alarms, or None if the task has no alarms."""
-        return None
-
     def finish(self) -> Sequence[Message]:
         """Return the remaining messages at the end of the session."""
         return []

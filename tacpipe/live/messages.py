@@ -92,7 +92,6 @@ class Sizes:
     steps: tuple[int, ...] = ()
     quantiles: tuple[int, ...] = ()
     unit: str = "1"
-    alarms: tuple[str, ...] = ()
 
 
 class Description:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tacpipe.sensors.sensor import Options
 
 CONFIG = "config.json"
-PATHS = ("model", "alarms_on", "split")
+PATHS = ("model",)
 
 
 class LiveModel(NamedTuple):

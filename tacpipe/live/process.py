@@ -205,7 +205,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     sys.setswitchinterval(SWITCH_S)
     if options.settings.realtime:
         wire.realtime(wire.MODEL)
-    send_line(connection, {"ready": True, "alarms": engine.alarm_levels()})
+    send_line(connection, {"ready": True})
     from tacpipe.models.tensors import one_thread  # imports torch, which the engine has already loaded
 
     with publishers, one_thread():  # set once, not in each forecast

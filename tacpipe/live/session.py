@@ -19,7 +19,7 @@ from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.live import wire
 from tacpipe.live.settings import SessionOptions
-from tacpipe.live.wire import AlarmsJson, RecorderTap, SessionFigures
+from tacpipe.live.wire import RecorderTap, SessionFigures
 from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import StreamNote
@@ -60,9 +60,9 @@ def describe_figures(figures: SessionFigures) -> list[str]:
     """Return the progress of a session in words.
 
     >>> describe_figures({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
-    ...     "states": {"load": "off", "slip": "unknown"},
+    ...     "states": {"slip": "0.02, alarm off"},
     ...     "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
-    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
+    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; slip 0.02, alarm off']
     """
     latency = figures.get("latency")
     answers = figures.get("answers", "answers")
@@ -92,7 +92,6 @@ class Supervisor:
         self.options, self.tap = options, tap
         self._noted_stream = options.own_streams[0]  # stream for notes on the process
         self.report: SessionFigures = {}  # last report of the running process
-        self.alarms: AlarmsJson | None = None  # levels of the alarms
         self.deaths = 0
         self.ready = False
         self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)  # counts of processes that have ended
@@ -244,7 +243,7 @@ class Supervisor:
                 return
             for content in self._lines.feed(data):
                 if "ready" in content:
-                    self.ready, self.alarms = True, content["alarms"]
+                    self.ready = True
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
                 elif "beginning" in content:

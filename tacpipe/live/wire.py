@@ -19,7 +19,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import TypedDict
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
@@ -77,15 +77,6 @@ class Blocks:
         del self._text[:offset]
 
 
-class AlarmsJson(TypedDict):
-    """The levels of a session's alarms; null if there is none."""
-
-    axes: list[list[str]]  # stream and axis of each load
-    levels: dict[str, list[float | None]]  # by alarm
-    floors: NotRequired[list[float]]
-    per_hour: float
-
-
 class LatencyFigures(TypedDict):
     """The latencies of a session's answers."""
 
@@ -118,7 +109,6 @@ class ModelLine(TypedDict, total=False):
     """A line from the model's process: its readiness, a rejection, a report, or the start of a recording."""
 
     ready: bool
-    alarms: AlarmsJson | None
     refused: str
     exit_code: int
     report: SessionFigures

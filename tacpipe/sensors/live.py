@@ -55,10 +55,6 @@ class MessageSizes(Protocol):
     def unit(self) -> str:
         """Unit of the channels."""
 
-    @property
-    def alarms(self) -> tuple[str, ...]:
-        """Names of the alarms."""
-
 
 class LiveColumn(NamedTuple):
     """One number of a values_of stream."""
@@ -173,12 +169,11 @@ class Live(Sensor):
     steps: tuple[int, ...] = ()  # prediction horizons in rows
     quantiles: tuple[int, ...] = ()  # quantile levels in percent
     unit: str = "count"  # unit of the channels
-    alarms: tuple[str, ...] = ()  # names of the alarms
     rate_hz: float = 0.0  # packets per second; 0: irregular
 
     def __post_init__(self) -> None:
         if not self._columns:
-            raise UsageError(f"live: a stream of the output {self.output} needs channels and steps, or alarms.")
+            raise UsageError(f"live: a stream of the output {self.output} needs channels and steps.")
         if self.size > MAX_PACKET:
             raise UsageError(
                 f"live: {len(self.channels)} channels at {len(self.steps)} steps with {len(self.quantiles)} quantiles need "

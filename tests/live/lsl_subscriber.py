@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from tacpipe.live import publishing
-from tacpipe.tasks.forward.live.alarms import State
 from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 
@@ -17,8 +16,7 @@ COUNT = 5
 
 def forecast() -> tuple[Any, list[Any]]:
     values = np.array([[1.5, -2.25], [3.0, 1e-3]], np.float32)
-    alarms = {"load": State(0, 0.5), "slip": State(1, 2.0)}
-    messages = [ForecastMessage(seq, seq, values + seq if seq % 2 else None, alarms=alarms) for seq in range(COUNT)]
+    messages = [ForecastMessage(seq, seq, values + seq if seq % 2 else None) for seq in range(COUNT)]
     return ForecastDescription(("a", "b"), (1, 2), "count", 50.0, "models/forward"), messages
 
 

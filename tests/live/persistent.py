@@ -22,8 +22,6 @@ from tacpipe.live.preparation import LiveModel
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs
-from tacpipe.tasks.forward.alarms import axes
-from tacpipe.tasks.forward.live.alarms import Alarms
 from tacpipe.tasks.forward.live.chain import Beginning, Cause, GridForecast
 from tacpipe.tasks.forward.live.engine import ForecastEngine
 from tacpipe.tasks.forward.live.task import ForwardSettings
@@ -120,17 +118,14 @@ class FakeModel:
 
 
 def engine(options: SessionOptions) -> ForecastEngine:
-    """Return an engine of this chain, with alarms that are never on."""
+    """Return an engine of this chain."""
     forward_settings = options.settings.task
     assert isinstance(forward_settings, ForwardSettings)
     rig = rigs.parse(options.rig)
-    layout = axes(Persistence.layout)
-    levels = {"load": tuple(1e9 for _ in layout), "slip": (1e9,)}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
     opened = functools.partial(Persistence, quantiles=forward_settings.quantiles)
-    alarms = Alarms(layout, levels, 1.0, (1.0,))
     forecast_engine = ForecastEngine(
-        sensors, opened, lambda _: alarms, forward_settings.steps or None, quantiles=forward_settings.quantiles
+        sensors, opened, forward_settings.steps or None, quantiles=forward_settings.quantiles
     )
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.live.websocket import WebsocketPublisher
-from tacpipe.tasks.forward.live.alarms import State
-from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
+from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tests.live.test_publishers import free_port
 from tests.recording.live import ROOT, awaited
 
@@ -27,20 +26,18 @@ def test_the_client_is_short() -> None:
 
 @pytest.mark.rig
 def test_the_client_reports_a_slip_that_is_predicted(tmp_path: Path) -> None:
-    (tmp_path / "client.py").write_text(client().replace("SILENT_S = 0.04", "SILENT_S = 60"))
+    (tmp_path / "client.py").write_text(client().replace("TIMEOUT_S = 0.04", "TIMEOUT_S = 60"))
     port = free_port()
-    publisher = WebsocketPublisher(
-        f"127.0.0.1:{port}", ForecastDescription(("a", "b"), (1, 2, 3), "count", 50.0, "model")
-    )
+    publisher = WebsocketPublisher(f"127.0.0.1:{port}", SlipDescription("model", 50.0, 0.3, "1", {}))
     words = [sys.executable, "client.py", f"ws://127.0.0.1:{port}", "4"]
     with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
         awaited(lambda: publisher.subscribers == 1)
         for seq, (state, cause) in enumerate([(0, ""), (1, ""), (1, ""), (-1, "nothing new comes from xela1")]):
-            publisher.publish(ForecastMessage(seq, seq, None, cause, alarms={"slip": State(state, 0.5)}))
+            publisher.publish(SlipMessage(seq, seq, 0.5, 0.0, state, cause=cause))
         out, _ = process.communicate(timeout=600)
     publisher.close()
     first, *changes = out.splitlines()
-    assert first == "2 channels, steps 1 to 3"
+    assert first == "probability of a slip within 0.3 s"
     assert [line.split(" ", 1)[1].strip() for line in changes] == [
         "slip: off",
         "slip: on",

@@ -32,9 +32,6 @@ def record(recording: Any, predictions: pa.Table) -> FakeRecording:
     late = (np.arange(len(t_ns)) >= LATE_ROW).astype(np.float32)
     session_streams = {
         "forecast": pa.table({**clocks, **columns}),
-        "alarm": pa.table(
-            {**clocks, "load_state": np.full(len(t_ns), -1, np.int8), "slip_state": np.full(len(t_ns), -1, np.int8)}
-        ),
         "latency": pa.table(
             {**clocks, "latency_ms": np.full(len(t_ns), LATENCY_MS, np.float32), "late": late, "skipped": 0 * late}
         ),

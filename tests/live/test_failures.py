@@ -40,7 +40,7 @@ def without(messages: list[dict[str, Any]], stream: str) -> list[dict[str, Any]]
     ]
 
 
-def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_unknown(lab: Lab) -> None:
+def test_a_stream_that_stalls_costs_the_forecasts_of_that_time(lab: Lab) -> None:
     faults = Faults(stall=0.7, stall_s=0.6)
     with live.served(lab.folder, SKIN, live.WRENCH, faults=faults), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
@@ -48,8 +48,6 @@ def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_un
         count = messages.index(without(messages, "skin")[0])
         live.awaited(lambda: len(forecasts(messages[count:])) > 20)
         printed = ended(process, interrupt=True)
-    silent = without(messages, "skin")
-    assert {alarm["state"] for message in silent for alarm in message["alarms"].values()} == {"unknown"}
     shard = live.only(lab.folder)
     arrivals = shard.table("skin").column("t_ns").to_numpy()
     points = shard.table("forecast").column("t_device_ns").to_numpy()

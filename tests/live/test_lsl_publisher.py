@@ -33,12 +33,12 @@ def test_forecasts_come_with_each_channel_and_step_and_nan_where_there_is_none(t
     pytest.importorskip("pylsl")
     outlet = heard(tmp_path, "forecast")
     assert (outlet["type"], outlet["rate"]) == ("Forecast", 50.0)
-    assert outlet["labels"] == ["a_t1", "b_t1", "a_t2", "b_t2", "load_state", "slip_state"]
-    assert outlet["units"] == ["count"] * 4 + ["1"] * 2
+    assert outlet["labels"] == ["a_t1", "b_t1", "a_t2", "b_t2"]
+    assert outlet["units"] == ["count"] * 4
     rows = np.array(outlet["rows"], np.float32)
     for seq, message in enumerate(forecast()[1]):
         expected = np.full(4, np.nan, np.float32) if message.values is None else message.values.ravel()
-        assert np.array_equal(rows[seq], [*expected, 0, 1], equal_nan=True)
+        assert np.array_equal(rows[seq], expected, equal_nan=True)
 
 
 def test_materials_come_with_their_probabilities_and_how_much_was_seen(tmp_path: Path) -> None:

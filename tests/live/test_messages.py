@@ -19,7 +19,6 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import LATENCIES, Live
 from tacpipe.sensors.plan import Plan, is_plan, packet
 from tacpipe.tasks.forward.live import messages as forward
-from tacpipe.tasks.forward.live.alarms import State
 from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 from tacpipe.tasks.material.live import messages as material
 from tacpipe.tasks.touch.live import messages as touch
@@ -29,16 +28,12 @@ CHANNELS = tuple(f"c{number}" for number in range(5))
 
 
 def message(values: Float32s | None = VALUES) -> ForecastMessage:
-    states = {"load": State(1, 2.5), "slip": State(-1, math.nan)}
-    return ForecastMessage(
-        7, 10**18, values, "why", 4, states, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1
-    )
+    return ForecastMessage(7, 10**18, values, "why", 4, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1)
 
 
 def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> None:
     content = json.loads(messages.to_json(message().to_dict()))
     assert np.array_equal(np.array(content["values"], dtype=np.float32), VALUES)
-    assert content["alarms"] == {"load": {"state": "on", "score": 2.5}, "slip": {"state": "unknown", "score": None}}
     assert (content["version"], content["seq"], content["t_ns"], content["cause"]) == (1, 7, 10**18, "why")
     assert json.loads(messages.to_json(message(None).to_dict()))["values"] is None
 
@@ -54,12 +49,12 @@ def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None
     assert replace(message(None), levels=(10, 90)).to_dict()["quantiles"] is None
     assert about.to_dict()["quantiles"] == [10, 90] and set(about.schema()) == set(with_quantiles.to_dict())
     columns = dict(zip([name for name, _ in about.columns()], with_quantiles.numbers(about).tolist(), strict=True))
-    assert columns["c4_t3"] == VALUES[2, 4] and columns["c4_t3_q10"] == VALUES[2, 4] - 1 and columns["load_state"] == 1
+    assert columns["c4_t3"] == VALUES[2, 4] and columns["c4_t3_q10"] == VALUES[2, 4] - 1
     sensor = Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3), quantiles=(10, 90))
     (packet,) = messages.packets(with_quantiles, sensor, 41)
     values = [number for block in decoded(sensor, packet)[0] for number in block]
     by_column = dict(zip([field.name for field in sensor.fields()], values, strict=True))
-    assert by_column == {name: value for name, value in columns.items() if not name.endswith("state")}
+    assert by_column == columns
     assert sensor.fields()[-1].metadata[b"quantile"] == b"0.9"
 
 
@@ -80,11 +75,7 @@ def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
     assert names[:6] == ["c0_t1", "c1_t1", "c2_t1", "c3_t1", "c4_t1", "c0_t2"]
 
 
-def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none() -> None:
-    (alarm,) = messages.packets(message(), Live(task="forward", output="alarm", alarms=("load", "slip")), 3)
-    assert alarm is not None
-    states, scores = decoded(Live(task="forward", output="alarm", alarms=("load", "slip")), alarm)[0]
-    assert states == [1, -1] and scores[0] == 2.5 and math.isnan(scores[1])
+def test_latencies_have_packets_too_and_a_missing_forecast_has_none() -> None:
     (latency,) = messages.packets(message(None), Live(), 3)
     assert latency is not None
     assert dict(zip(LATENCIES, decoded(Live(), latency)[0][0], strict=True)) == {
@@ -97,16 +88,12 @@ def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none()
 
 
 def test_packets_of_another_output_or_version_are_refused() -> None:
-    (sent,) = messages.packets(message(), Live(task="forward", output="alarm", alarms=("load", "slip")), 3)
+    sensor = Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3))
+    (sent,) = messages.packets(message(), sensor, 3)
     assert sent is not None
     other_version = sent[:4] + b"\x02" + sent[5:]
     for wrong in (other_version, sent[:-1], b"x" + sent[1:]):
-        assert (
-            Live(task="forward", output="alarm", alarms=("load", "slip"))
-            .framer()
-            .feed(Chunks.from_pairs([(0, wrong)]))[0]
-            == []
-        )
+        assert sensor.framer().feed(Chunks.from_pairs([(0, wrong)]))[0] == []
 
 
 def test_a_forecast_that_is_too_large_for_a_packet_is_refused_with_what_to_do() -> None:
@@ -144,7 +131,6 @@ EXPECTED: dict[str, Any] = json.loads((Path(__file__).parent / "published_bytes.
 T_NS = 10**18
 MEASURED: dict[str, Any] = {"latency_ms": 3.25, "compute_ms": 1.0, "skipped": 2, "late": 1}
 PUBLISHED_VALUES = np.array([[0.5, -1.25], [2.0, 1e-3]], np.float32)
-STATES = {"load": State(1, 2.5), "slip": State(-1, math.nan)}
 Case = tuple[Description, Sequence[Message], dict[str, Live]]
 
 
@@ -158,7 +144,6 @@ def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
         PUBLISHED_VALUES,
         cause,
         flags,
-        STATES,
         T_NS - 5,
         age_ms=4.5,
         levels=levels,
@@ -166,10 +151,7 @@ def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
         **MEASURED,
     )
     sizes: dict[str, Any] = {"channels": ("a", "b"), "steps": (1, 3), "quantiles": levels, "unit": unit}
-    streams = {
-        "forecast": Live(task="forward", output="forecast", **sizes),
-        "alarm": Live(task="forward", output="alarm", alarms=("load", "slip")),
-    }
+    streams = {"forecast": Live(task="forward", output="forecast", **sizes)}
     return about, [answer, forward.ForecastMessage(8, T_NS, None, "no", 3, levels=levels)], streams
 
 

@@ -26,9 +26,6 @@ FULL = {
     "plan": "rig:robot",
     "publish": ["ws:127.0.0.1:8765", "udp:10.0.0.2:9000"],
     "steps": [1, 5],
-    "alarms_per_hour": 6,
-    "alarms_on": "data/c",
-    "split": "data/split",
     "settle_ms": 3,
     "realtime": True,
     "quantiles": [10, 90],
@@ -47,16 +44,9 @@ def forward_settings(file_settings: dict[str, Any], **options: Any) -> ForwardSe
 
 def test_what_the_file_states_counts_and_options_of_the_command_win() -> None:
     merged = settings(FULL, plan=None, realtime=False, publish=("lsl:touch",), settle_ms=1.5)
-    expected = ForwardSettings("rig:robot", "", (1, 5), (10, 90), 6.0, "data/c", "data/split")
+    expected = ForwardSettings("rig:robot", "", (1, 5), (10, 90))
     assert merged == Settings("models/f", ("lsl:touch",), 1.5, realtime=False, task=expected)
     assert settings({}, model="models/g") == Settings("models/g", task=ForwardSettings())
-
-
-def test_alarms_of_the_file_are_switched_off_by_the_option_and_a_split_belongs_to_its_recordings() -> None:
-    off = forward_settings(FULL, alarms_per_hour=0.0)
-    assert (off.alarms_per_hour, off.alarms_on, off.split) == (0.0, "", "")
-    moved = forward_settings(FULL, alarms_on="data/others")
-    assert (moved.alarms_per_hour, moved.alarms_on, moved.split) == (6.0, "data/others", "")
 
 
 @pytest.mark.parametrize(
@@ -69,10 +59,6 @@ def test_alarms_of_the_file_are_switched_off_by_the_option_and_a_split_belongs_t
         ({**FULL, "places": {}}, {}, "there is no key places"),
         (FULL, {"settle_ms": 5000.0}, "--settle-ms is 5000; it must be a number from 0 to 1000."),
         ({"model": "m", "rank": "contact"}, {}, "rig.toml, live: there is no key rank; there are model,"),
-        ({"model": "m", "alarms_per_hour": 6}, {}, "rig.toml, live: alarms_per_hour also needs alarms_on"),
-        ({"model": "m", "alarms_on": "d"}, {}, "rig.toml, live: alarms_on also needs alarms_per_hour"),
-        ({"model": "m"}, {"alarms_per_hour": 6.0}, "--alarms-per-hour also needs --alarms-on"),
-        ({"model": "m", "split": "s"}, {}, "rig.toml, live: split has no effect without --alarms-on."),
         ({"model": "m", "steps": [0]}, {}, "rig.toml, live: steps"),
     ],
 )
@@ -159,17 +145,15 @@ def test_a_session_is_what_the_file_states_but_for_the_options_given(lab: Lab, m
     for training_command in TRAINED:
         lab.run(training_command)
     table = 'model = "models/f"\nplan = "udp::9100"\nsteps = [2]\nsettle_ms = 3\n'
-    alarms = 'alarms_per_hour = 60\nalarms_on = "data/c"\nsplit = "data/split"\n'
-    Path("rig.toml").write_text(f"{STREAM}[live]\n{table}{alarms}")
+    Path("rig.toml").write_text(f"{STREAM}[live]\n{table}")
     prepared_sessions: list[Any] = []
     monkeypatch.setattr(command, "_run", lambda prepared, *arguments, **keywords: prepared_sessions.append(prepared))
     lab.run("live rig.toml --settle-ms 1 --publish udp:127.0.0.1:9000")
     (prepared,) = prepared_sessions
     common, task_settings = prepared.options.settings, prepared.options.settings.task
     assert common.model == str(Path("models/f").absolute()) and task_settings.steps == (2,) and common.settle_ms == 1.0
-    assert task_settings.alarms_per_hour == 60 and task_settings.split == str(Path("data/split").absolute())
     assert common.publish == ("udp:127.0.0.1:9000",) and "plan" in prepared.options.streams
-    assert prepared.attributes["live_plan"] == "udp::9100" and prepared.attributes["live_alarms_per_hour"] == 60
+    assert prepared.attributes["live_plan"] == "udp::9100"
     assert SessionOptions.from_json(prepared.options.to_json()) == prepared.options
 
 

@@ -21,7 +21,6 @@ from tacpipe.metrics import calibration, headline
 from tacpipe.metrics.calibration import COVERAGE_FILE, Sums
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks
-from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import (
     BASELINE,
@@ -35,7 +34,6 @@ from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, iterate_predictions
 from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
 from tacpipe.tasks.forward.situations import BySituation
-from tacpipe.tasks.forward.slips import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
 
@@ -196,8 +194,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     check_codec(model, recordings.files)
     seen_digests, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, outputs = [], {}
-    loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), QuantileSums(forecaster)
-    slipping = SlipAlarms.of(forecaster)
+    bands = QuantileSums(forecaster)
     by_situation, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with terminal.progress_bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
@@ -207,10 +204,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
                 name, shard.digest in seen_digests, track.object, track.object is None or track.object in objects
             )
             attributes = {**shard.attributes, "seen": trial.seen}
-            if not trial.seen:
-                loads.begin(track)
-                slipping.begin(track)
-            rows = _predictions(forecaster, track, trial, (loads, slipping), by_situation, spill)
+            rows = _predictions(forecaster, track, trial, by_situation, spill)
             outputs[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
             bands.add(track, trial)
@@ -219,8 +213,6 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     groups = metrics.channel_groups(forecaster.codec.layout)
     measured = replace(
         metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale),
-        anticipation=loads.scored(forecaster.config.get("anticipation", {})),
-        slips=slipping.scored(),
         situations=by_situation.summary(),
         quantiles=bands.summary(trials),
     )
@@ -243,17 +235,14 @@ def _predictions(
     forecaster: Forecaster,
     track: Track,
     trial: Trial,
-    alarms: tuple[Loads, SlipAlarms],
     by_situation: BySituation,
     spill: Spill,
 ) -> pa.Table | pa.RecordBatchReader:
     """Return the predictions for all windows of a recording, spilled to ``spill``; adds its errors to ``trial``.
 
-    If the model has not seen the recording, adds what alarms need to ``alarms``, in which the recording was started,
-    and its errors by situation to ``by_situation``. Only some windows, and of each one predictor, are in memory at a
-    time.
+    If the model has not seen the recording, adds its errors by situation to ``by_situation``. Only some windows, and of
+    each one predictor, are in memory at a time.
     """
-    loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     no_windows = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
@@ -263,12 +252,9 @@ def _predictions(
         doing = situations.window_situations(track, windows.now, forecaster.horizon)
         if not trial.seen:
             by_situation.count(trial.name, doing)
-        present = track.tactile[windows.now]
         for name, prediction in windows.predictions.items():
             trial.add_errors(name, prediction, windows.truth, forecaster.feature_half)
             if not trial.seen:
-                loads.add_one(name, windows.now, prediction)
-                slipping.add_one(name, windows.now, present, prediction.count)
                 by_situation.add(trial.name, doing, name, prediction, windows.truth)
         stored = windows.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
         gathered.add(_prediction_table(forecaster, track, windows.now, steps, np.ascontiguousarray(stored)))

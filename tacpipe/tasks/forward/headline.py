@@ -17,10 +17,8 @@ from tacpipe.metrics.pairing import Measure, Sums
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.tasks.forward.alarms import AlarmScore
     from tacpipe.tasks.forward.params import ForwardConfig, QuantileDescription
     from tacpipe.tasks.forward.situations import SituationMeasures
-    from tacpipe.tasks.forward.slips import LeadSums, SlipScore
 
 COUNT, COUNTS = "count", "counts"  # unit in column names and in text
 MIXED = "own units"  # unit if channels or models differ
@@ -128,7 +126,6 @@ class LiveMeasures(TypedDict):
     rows: LiveRows
     mae: dict[str, dict[str, float]]  # by predictor and step
     latency: dict[str, float]
-    alarms: dict[str, dict[str, LeadSums]]  # by alarm and event, then by predictor
 
 
 class LiveMetrics(LiveMeasures):
@@ -193,8 +190,6 @@ class ForwardMetrics:
 
     fresh: ForwardScores  # on recordings that the model has not seen
     parts: dict[str, ForwardScores]  # by each of `METRIC_PARTS` that contains recordings
-    anticipation: dict[str, AlarmScore] = field(default_factory=dict)  # by predictor
-    slips: dict[str, SlipScore] = field(default_factory=dict)  # by predictor
     situations: dict[str, SituationMeasures] = field(default_factory=dict)
     quantiles: QuantileMetrics | None = None
     live: LiveMetrics | None = None
@@ -205,8 +200,6 @@ class ForwardMetrics:
         return cls(
             ForwardScores.from_json(stored),
             {name: ForwardScores.from_json(stored[name]) for name in METRIC_PARTS if name in stored},
-            stored.get("anticipation", {}),
-            stored.get("slips", {}),
             stored.get("situations", {}),
             QuantileMetrics.from_json(stored["quantiles"]) if "quantiles" in stored else None,
             stored.get("live"),
@@ -215,8 +208,6 @@ class ForwardMetrics:
     def to_json(self) -> Json:
         """Return the content of ``metrics.json`` without metrics that were not computed."""
         optional = {
-            "anticipation": self.anticipation,
-            "slips": self.slips,
             "situations": self.situations,
             "quantiles": self.quantiles and self.quantiles.to_json(),
             "live": self.live,

@@ -231,13 +231,6 @@ class LookAhead(TypedDict):
     max_ms: float
 
 
-class AlarmLevels(TypedDict, total=False):
-    """Alarm levels set on validation recordings, in a model's configuration; empty without such recordings."""
-
-    sd: list[float]  # standard deviation of each load's change
-    theta: dict[str, list[float | None]]  # level of each load by predictor; None: no alarms
-
-
 class QuantileDescription(TypedDict):
     """Calibration of a model's quantiles, in its configuration."""
 
@@ -264,7 +257,6 @@ class ForwardConfig(ModelConfig):
     objects: list[str]
     counts: dict[str, dict[str, int]]
     baselines: NotRequired[dict[str, float]]
-    anticipation: NotRequired[AlarmLevels]
     quantiles: NotRequired[QuantileDescription]
 
 

@@ -27,7 +27,7 @@ class ForwardTask(Task):
     name = "forward"
 
     @staticmethod
-    @stage(version=5, requirements=REQUIREMENTS)
+    @stage(version=6, requirements=REQUIREMENTS)
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 
@@ -74,7 +74,7 @@ class ForwardTask(Task):
 
     @property
     def live(self) -> LiveTask:
-        """Forecasts with alarms at each grid point."""
+        """Forecasts at each grid point."""
         from tacpipe.tasks.forward.live.task import ForwardLive
 
         return ForwardLive()

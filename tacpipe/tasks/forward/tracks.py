@@ -106,18 +106,6 @@ def _fits_float32(kind: pa.DataType) -> bool:
     return bool(small or pa.types.is_float32(kind) or pa.types.is_float16(kind))
 
 
-# label from `segment slips` or a person; label stream of a published dataset; ground truth of the simulator
-COLUMNS = ("slip", "slip_slip", "gt_slip")
-
-
-def slips_of(table: pa.Table | Columns) -> Bools | None:
-    """Return when the object slips (time,), from a label or the simulator's ground truth; None if there is neither."""
-    for name in COLUMNS:
-        if name in table.column_names:
-            return np.asarray(table.column(name).to_numpy()) > 0
-    return None
-
-
 POSE = poses.DEFAULT_POSE.columns
 VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
@@ -145,7 +133,6 @@ class Track:
     tactile: AnyFloats | Levels  # (time, channel), float64
     timeline: str = "uniform"  # grid: uniform, logged or fresh
     object: str | None = None  # grasped object, if it is labelled
-    slips: Bools | None = None  # (time,), rows in which the object slips, if known; only for evaluation
     # (time, 6), velocities of a plan with these poses; None: the velocities in ``arm``
     plan_velocity: AnyFloats | None = None
 
@@ -162,9 +149,8 @@ class Track:
         selected = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
-        for name in ("slips", "plan_velocity"):
-            if getattr(self, name) is not None:
-                selected[name] = getattr(self, name)[first:last]
+        if self.plan_velocity is not None:
+            selected["plan_velocity"] = self.plan_velocity[first:last]
         return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **selected)
 
     def planned_arm(self, rows: Int64s) -> AnyFloats:
@@ -282,7 +268,7 @@ def track(
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         arm, plan_velocity = _motion(table, pose, storage)
         finger = _finger_width(table)
-        gaps, slips = tactile.gap_mask(table), slips_of(table)
+        gaps = tactile.gap_mask(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     del table
@@ -302,7 +288,6 @@ def track(
         counts_above_rest,
         timeline,
         None if labelled_object is None else str(labelled_object),
-        slips,
         plan_velocity,
     )
 

@@ -30,7 +30,6 @@ from tacpipe.models.linear import CHUNK, FittedBaselines, WindowArrays
 from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks.forward import headline, networks, tracks
-from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
     CONFIG,
@@ -44,7 +43,6 @@ from tacpipe.tasks.forward.forecaster import (
 from tacpipe.tasks.forward.headline import look_ahead_notes
 from tacpipe.tasks.forward.networks import Rows, WindowLevels, rows_of_tracks, with_actions
 from tacpipe.tasks.forward.params import (
-    AlarmLevels,
     CodecDescription,
     ForwardConfig,
     ForwardScaling,
@@ -52,7 +50,6 @@ from tacpipe.tasks.forward.params import (
     ModelInputs,
     Params,
 )
-from tacpipe.tasks.forward.predictors import iterate_predictions
 from tacpipe.tasks.forward.tracks import BLOCK_ROWS, Track
 from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
@@ -152,10 +149,12 @@ def train(
         files[BASELINES] = save_arrays(
             {name: np.ascontiguousarray(array) for name, array in linear.to_tensors().items()}
         )
-    files |= {WEIGHTS: save_tensors(weights), CONFIG: model_files.to_json(config)}
-    if params.baselines:
-        config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
-    return {**files, CONFIG: model_files.to_json(config), HISTORY: history_bytes(trained.history)}
+    return {
+        **files,
+        WEIGHTS: save_tensors(weights),
+        CONFIG: model_files.to_json(config),
+        HISTORY: history_bytes(trained.history),
+    }
 
 
 def _built(
@@ -231,17 +230,6 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
             if name.endswith(streams.GAP_MS) and value is not None:
                 values.setdefault(name.removesuffix(streams.GAP_MS), []).append(float(value))
     return {stream: float(np.median(gaps_ms)) for stream, gaps_ms in sorted(values.items())}
-
-
-def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> AlarmLevels:
-    """Return the alarm levels, set on the validation recordings."""
-    loads = Loads(forecaster.codec.layout, forecaster.horizon)
-    for track in part:
-        loads.begin(track)
-        for windows in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            loads.add(windows)
-            del windows  # frees the memory for the next windows
-    return loads.calibrated()
 
 
 def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:

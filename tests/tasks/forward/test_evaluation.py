@@ -31,7 +31,7 @@ from tests.tasks.forward.trials import (
     trained,
 )
 
-OTHERS = {"known", "unseen", "counts", "skill", "anticipation", "situations", "context_mean"}
+OTHERS = {"known", "unseen", "counts", "skill", "situations", "context_mean"}
 LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
 
 
@@ -193,7 +193,7 @@ def test_recordings_that_the_model_has_seen_are_told_apart(model: dict[str, byte
     assert result.recordings[TRAIN[0].name].attributes["seen"] is True
     assert result.recordings[TEST[0].name].attributes == {"trial": 20, "object": "cup", "seen": False}
     only, _ = evaluated(model, TRAIN[0])
-    assert "model" not in only and "anticipation" not in only
+    assert "model" not in only
     assert only["counts"]["recordings"] == 0 and only["seen"]["counts"]["recordings"] == 1
 
 
@@ -204,7 +204,7 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
             assert set(metrics[predictor]["mae_counts"][group]) == {"t1", "t2", "t3", "t4", "mean"}
     assert set(metrics) == {
         *({"model", "persistence", "context_mean"} | LINEAR),
-        *("counts", "skill", "anticipation", "situations", "known", "unseen"),
+        *("counts", "skill", "situations", "known", "unseen"),
     }
     assert set(metrics["model"]) == {"mse_counts", "mae_counts", "mse_standard", "mse_latent", "mse_feature"}
     assert set(metrics["ridge"]) == {"mse_counts", "mae_counts", "mse_standard"}
@@ -221,13 +221,11 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
     }
 
 
-def test_alarms_are_counted_for_the_model_and_whatever_it_has_to_beat(model: dict[str, bytes]) -> None:
-    metrics, _ = evaluated(model, *TEST)
-    assert set(metrics["anticipation"]) == {"model", "persistence", *(LINEAR - {"train_mean"})}
-    for counts_of_alarms in metrics["anticipation"].values():
-        assert set(counts_of_alarms) == {
-            *("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute"),
-        }
+def test_a_model_that_was_stored_with_alarm_levels_is_evaluated_as_one_without(model: dict[str, bytes]) -> None:
+    config = json.loads(model["config.json"])
+    config["anticipation"] = {"sd": [1.0], "theta": {"model": [2.0, None]}}
+    stored_before = {**model, "config.json": json.dumps(config).encode()}
+    assert evaluated(stored_before, *TEST)[0] == evaluated(model, *TEST)[0]
 
 
 def test_features_are_measured_in_half_their_training_range(model: dict[str, bytes]) -> None:

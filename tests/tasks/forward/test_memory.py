@@ -8,11 +8,9 @@ import pytest
 
 from tacpipe.io.spill import Spill
 from tacpipe.tasks.forward import evaluation, predictors, tracks
-from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.situations import BySituation
-from tacpipe.tasks.forward.slips import SlipAlarms
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained
@@ -24,11 +22,9 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     """Return what the evaluation of a recording of so many rows takes at most, besides its track."""
     shard: FakeShard = motion(0, rows=rows)
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
-    loads = Loads(forecaster.codec.layout, forecaster.horizon)
     by_situation = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     tracemalloc.start()
-    alarms = (loads, SlipAlarms.of(forecaster))
-    evaluation._predictions(forecaster, track, Trial("a", True), alarms, by_situation, Spill(1))
+    evaluation._predictions(forecaster, track, Trial("a", True), by_situation, Spill(1))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak

@@ -107,7 +107,6 @@ def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
     }
     assert stored["params"] == to_json(params(stride=2, loss="absolute"))
     assert set(stored["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
-    assert set(stored["anticipation"]) == {"sd", "theta"}
 
 
 def test_scales_are_those_of_numpy_over_the_training_rows(tmp_path: Path) -> None:
@@ -281,7 +280,7 @@ def test_a_model_of_latents_holds_its_codec(representation: str, name: str, tmp_
 def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     files = trained(tmp_path, baselines=False)
     assert set(files) == FILES - {"baselines.safetensors"}
-    assert not {"baselines", "anticipation"} & set(config(files))
+    assert "baselines" not in config(files)
     metrics, _ = evaluated(files, motion(20))
     assert {"model", "persistence", "context_mean", "skill", "counts", "situations"} == set(metrics)
 

@@ -1,1 +1,1 @@
-"""Forecast during a live session: the causal chain of a model, its messages and its alarms."""
+"""Forecast during a live session: the causal chain of a model and its messages."""

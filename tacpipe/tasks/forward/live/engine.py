@@ -22,14 +22,12 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.tasks.forward.live.alarms import NOTHING_KNOWN, Alarms
 from tacpipe.tasks.forward.live.chain import Beginning, Cause, GridForecast
 from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.live.wire import AlarmsJson
 
 PERIODS = 2.0  # periods without a forecast after which a message reports the cause
 SLACK_NS = 5_000_000  # additional time for jitter
@@ -97,7 +95,6 @@ class ForecastEngine(Engine):
         self,
         sensors: Mapping[str, Sensor],
         opened: Opened,
-        alarms: Callable[[CausalChain], Alarms],
         steps: Sequence[int] | None = None,
         *,
         settle_ns: int = SETTLE_NS,
@@ -107,7 +104,6 @@ class ForecastEngine(Engine):
         self._open_chain = opened
         self.quantiles = tuple(quantiles)
         self.chain = opened({name: likely_schema(sensor) for name, sensor in self.sensors.items()}, None)
-        self.alarms = alarms(self.chain)
         self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
         self._late = 0  # late samples of earlier chains
         self._first: dict[str, pa.Schema] = {}  # schema of the first samples of each stream
@@ -137,10 +133,6 @@ class ForecastEngine(Engine):
         """Return the description of the values in messages."""
         chain = self.chain
         return ForecastDescription(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
-
-    def alarm_levels(self) -> AlarmsJson:
-        """Return the thresholds of the alarms."""
-        return self.alarms.to_json()
 
     def continue_recording(self, beginning: str) -> None:
         """Store grid and rest level of an earlier process, which the next recording continues."""
@@ -237,20 +229,18 @@ class ForecastEngine(Engine):
                     self.chain.push(name, decoder.columns(batch, offset_ns))
 
     def _message(self, forecast: GridForecast, now_ns: int) -> ForecastMessage:
-        values, levels, states = None, None, dict(NOTHING_KNOWN)
+        values, levels = None, None
         if forecast.count is not None and forecast.now is not None:
             published_rows = [step - 1 for step in self.steps]
             values = np.ascontiguousarray(forecast.count[published_rows], dtype=np.float32)
             if forecast.quantiles is not None:
                 levels = np.ascontiguousarray(forecast.quantiles[published_rows].transpose(2, 0, 1), dtype=np.float32)
-            states = self.alarms.states(forecast.count, forecast.now, self.chain.layout)
         return ForecastMessage(
             self.next_seq(),
             forecast.t_ns,
             values,
             describe_cause(forecast),
             forecast.cause.value,
-            states,
             forecast.made_from_t_ns,
             skipped=self.skipped,
             levels=self.quantiles,

@@ -1,8 +1,8 @@
 """Evaluate recordings of live sessions: compare the published forecasts with those of the offline chain and model.
 
 `evaluate` returns the result of `tacpipe evaluate` on the recordings after the model's own stages, and adds what the
-session recorded: errors of the published forecasts, alarms with their leads, latencies, and whether `tacpipe predict
---causal` reproduces the published values bit for bit.
+session recorded: errors of the published forecasts, latencies, and whether `tacpipe predict --causal` reproduces the
+published values bit for bit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
@@ -24,24 +23,19 @@ from tacpipe.live.extraction import extracted_streams
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
-from tacpipe.tasks.forward import alarms as load_alarms
 from tacpipe.tasks.forward import evaluation
 from tacpipe.tasks.forward import headline as headlines
-from tacpipe.tasks.forward.alarms import loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import ForwardMetrics, LiveMetrics
 from tacpipe.tasks.forward.live import measures, replay
-from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.tasks.forward.predictors import forecasts
-from tacpipe.tasks.forward.slips import Leads, events, leads
 from tacpipe.tasks.forward.tracks import Levels, Track
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
-LEVELS = "live_alarm_levels"  # attribute of a recording: the thresholds of its alarms, as JSON
 DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 MODEL = "live_model"  # attribute of a recording: the digest of the model of its session
 
@@ -132,7 +126,6 @@ def _session(
         _after(session.t_ns[~equal & np.isin(session.t_ns, made_ns)], grew, forecaster),
         rows,
         sums,
-        _alarms(forecaster, recording, tables, track, predicted),
         latency.column("latency_ms").to_numpy().astype(np.float64),
         int(latency.column("skipped").to_numpy().max(initial=0)),
         int(late.max(initial=0)),
@@ -200,61 +193,6 @@ def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
         return 0
     place = np.searchsorted(late_ns, differing_ns + 1.5 * period_ns, side="right") - 1
     return int(((place >= 0) & (differing_ns - late_ns[np.maximum(place, 0)] <= reach_ns)).sum())
-
-
-def _alarms(
-    forecaster: Forecaster,
-    recording: Recording,
-    tables: Mapping[str, pa.Table],
-    track: Track,
-    predicted: _Offline,
-) -> dict[str, dict[str, Leads]]:
-    """Return the leads of alarms by alarm and event, live and offline."""
-    stream = tables["alarm"]
-    states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
-    if not any((measured >= 0).any() for measured in states.values()):
-        return {}
-    series = {LIVE: (times(stream), states)}
-    if LEVELS in recording.attributes and len(predicted.now):
-        series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
-    period_ns = round(1e9 / float(forecaster.config["rate_hz"]))
-    alarms: dict[str, dict[str, Leads]] = {}
-    for event, times_ns in _events(forecaster, track).items():
-        for name in NAMES:
-            for source, (t_ns, states_by_alarm) in series.items():
-                measured = leads(t_ns, states_by_alarm[name], times_ns, forecaster.horizon * period_ns, period_ns)
-                alarms.setdefault(f"{name} alarm, {event}", {})[source] = measured
-    return alarms
-
-
-def _events(forecaster: Forecaster, track: Track) -> dict[str, Times]:
-    """Return when loads change, as `tacpipe evaluate` defines it, and when the object slips, if known (event, 2)."""
-    events_ns: dict[str, Times] = {}
-    sd = forecaster.config.get("anticipation", {}).get("sd")
-    if sd:
-        values = loads(np.where(track.usable[:, None], track.tactile[:], np.nan), forecaster.codec.layout)
-        rows = load_alarms.changes(values, track.groups, horizon=forecaster.horizon, sd=np.array(sd))
-        changing = np.zeros(len(track.t_ns), bool)
-        for runs in rows:
-            for first, stop in runs:
-                changing[first:stop] = True
-        events_ns["changes of load"] = events(track.t_ns, changing)
-    if track.slips is not None:
-        events_ns["slips"] = events(track.t_ns, track.slips)
-    return events_ns
-
-
-def _offline_states(
-    forecaster: Forecaster, recording: Recording, track: Track, predicted: _Offline
-) -> dict[str, Int64s]:
-    """Return the alarm states (window,) of offline predictions with the session's thresholds."""
-    alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
-    layout = forecaster.codec.layout
-    states = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
-    for index, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
-        for name, state in alarms.states(ahead, track.tactile[row], layout).items():
-            states[name][index] = state.state
-    return states
 
 
 def _headline(

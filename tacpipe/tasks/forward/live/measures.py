@@ -1,4 +1,4 @@
-"""Measure recorded live sessions against the recordings: equality, errors, latencies and alarms.
+"""Measure recorded live sessions against the recordings: equality, errors and latencies.
 
 Times are those of rows of the live grid. The truth is the recording after the model's own stages, offline; counts between
 two of its rows are interpolated. Counts here include the level at rest, because that of a session and that of the whole
@@ -7,7 +7,7 @@ recording may differ by some counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,9 +15,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Int64s, Times
 from tacpipe.live.messages import summarize_latencies
-from tacpipe.tasks.forward import slips
 from tacpipe.tasks.forward.headline import LiveMeasures
-from tacpipe.tasks.forward.slips import Leads, LeadSums
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,6 @@ class Session(NamedTuple):
     explained: int  # published rows that differ after a sample that came too late
     rows: int  # rows whose errors count
     sums: Sums
-    alarms: dict[str, dict[str, Leads]]  # alarm and event, to live and offline
     latency_ms: Floats
     skipped: int
     late: int
@@ -135,18 +132,7 @@ def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> 
         },
         "mae": mae,
         "latency": summarize_latencies(np.concatenate([session.latency_ms for session in sessions])),
-        "alarms": _pooled([session.alarms for session in sessions]),
     }
-
-
-def _pooled(sessions: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, dict[str, LeadSums]]:
-    """Return what alarms were worth over sessions."""
-    pooled: dict[str, dict[str, LeadSums]] = {}
-    for kind in dict.fromkeys(kind for session in sessions for kind in session):
-        for source in dict.fromkeys(source for session in sessions for source in session.get(kind, {})):
-            parts = [session[kind][source] for session in sessions if source in session.get(kind, {})]
-            pooled.setdefault(kind, {})[source] = slips.summed(parts)
-    return pooled
 
 
 def sentences(live: LiveMeasures) -> list[str]:

@@ -1,22 +1,21 @@
-"""Define the messages of a session with a forecasting model: a forecast with its alarms at each grid point."""
+"""Define the messages of a session with a forecasting model: a forecast at each grid point."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Float32s
+from tacpipe.arrays import Float32s
 from tacpipe.io import JsonObject
 from tacpipe.live import messages
-from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values, rounded
+from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
-from tacpipe.tasks.forward.live.alarms import NAMES, NOTHING_KNOWN, State
 
-FORECAST, ALARM = "forecast", "alarm"  # recorded streams
+FORECAST = "forecast"  # the recorded stream
 MATRIX = {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}  # (step, channel)
 QUANTILES: frozenset[str] = frozenset({"quantiles"})
 
@@ -35,10 +34,6 @@ def _quantile_columns(sizes: MessageSizes) -> list[LiveColumn]:
         for level in sizes.quantiles
         for name, unit, metadata in _value_columns(sizes)
     ]
-
-
-def _alarm_columns(suffix: str, sizes: MessageSizes) -> list[LiveColumn]:
-    return [LiveColumn(f"{alarm}_{suffix}") for alarm in sizes.alarms]
 
 
 DECLARATION = Declaration(
@@ -72,38 +67,21 @@ DECLARATION = Declaration(
             columns=_quantile_columns,
         ),
         Value("cause", "reason why there is no forecast, or the missing input", "string"),
-        Value("alarms", "`state` (on, off or unknown) and `score` of each alarm", "object", attribute="alarms_by_name"),
-        Value(
-            "alarm_states",
-            "1 on, 0 off, -1 unknown",
-            streams=(ALARM, LSL),
-            type="i1",
-            quantity="alarm",
-            columns=lambda sizes: _alarm_columns("state", sizes),
-        ),
-        Value(
-            "alarm_scores",
-            "score of each alarm in multiples of its level; above 1 it is on",
-            streams=(ALARM,),
-            quantity="alarm",
-            columns=lambda sizes: _alarm_columns("score", sizes),
-        ),
         *latency_values("latency_ms", "age_ms", "skipped"),
     ),
-    {FORECAST: 0, ALARM: 1},
+    {FORECAST: 0},
 )
 
 
 @dataclass
 class ForecastMessage(messages.Message):
-    """A forecast with its alarms, or why there is none."""
+    """A forecast, or why there is none."""
 
     seq: int
     t_ns: int  # time of the grid point, UTC as in the recording
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
     cause: str = ""  # reason why there is no forecast, or the missing input
     flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
-    alarms: Mapping[str, State] = field(default_factory=lambda: dict(NOTHING_KNOWN))
     made_from_t_ns: int = 0  # arrival of the newest sample that was read
     latency_ms: float = math.nan
     age_ms: float = math.nan
@@ -128,8 +106,8 @@ class ForecastMessage(messages.Message):
 
     @property
     def states(self) -> Mapping[str, str]:
-        """The state of each alarm."""
-        return {name: alarm.word for name, alarm in self.alarms.items()}
+        """No text, because a forecast has many numbers."""
+        return {}
 
     @property
     def quantiles_by_level(self) -> dict[str, list[list[float]]] | None:
@@ -144,21 +122,6 @@ class ForecastMessage(messages.Message):
         if self.quantiles is None:
             return None if self.levels else np.empty(0, np.float32)
         return self.quantiles.ravel()
-
-    @property
-    def alarms_by_name(self) -> dict[str, dict[str, str | float | None]]:
-        """State and score of each alarm as JSON."""
-        return {name: {"state": alarm.word, "score": rounded(alarm.score)} for name, alarm in self.alarms.items()}
-
-    @property
-    def alarm_states(self) -> list[int]:
-        """The state of each alarm as a number."""
-        return [self.alarms[name].state for name in NAMES]
-
-    @property
-    def alarm_scores(self) -> AnyFloats:
-        """The score of each alarm (alarm,), in the order of `NAMES`."""
-        return np.array([self.alarms[name].score for name in NAMES], np.float32)
 
 
 @dataclass(frozen=True)
@@ -176,8 +139,8 @@ class ForecastDescription(messages.Description):
 
     @property
     def sizes(self) -> Sizes:
-        """The numbers of channels, steps, quantiles and alarms."""
-        return Sizes(self.channels, self.steps, self.quantiles, self.unit, NAMES)
+        """The numbers of channels, steps and quantiles."""
+        return Sizes(self.channels, self.steps, self.quantiles, self.unit)
 
     @property
     def absent(self) -> frozenset[str]:

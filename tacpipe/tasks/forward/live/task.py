@@ -1,17 +1,17 @@
-"""Run forecasting models live: their settings, the plan of a session, and the engine with its alarms."""
+"""Run forecasting models live: their settings, the plan of a session, and the engine."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.settings import LiveTask, SessionPlan, Settings, SettingValues, TaskSettings, option
-from tacpipe.plugins.constraints import PositiveInt, Range
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
+from tacpipe.plugins.constraints import PositiveInt
 from tacpipe.sensors.plan import MEASURED
-from tacpipe.tasks.forward.live.messages import ALARM, DECLARATION, FORECAST
+from tacpipe.tasks.forward.live.messages import DECLARATION, FORECAST
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
@@ -20,12 +20,8 @@ if TYPE_CHECKING:
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Options, Sensor
-    from tacpipe.tasks.forward.live.alarms import Alarms
-    from tacpipe.tasks.forward.live.engine import CausalChain
     from tacpipe.tasks.forward.params import ForwardConfig
     from tacpipe.tasks.task import PredictionRequest
-
-ALARM_KEYS = ("alarms_per_hour", "alarms_on", "split")
 
 
 @dataclass(frozen=True)
@@ -37,32 +33,6 @@ class ForwardSettings(TaskSettings):
     plan_from: str = ""  # IP address whose plans are accepted, for --plan udp:HOST:PORT
     steps: tuple[PositiveInt, ...] = ()  # Steps ahead that are published; all by default
     quantiles: tuple[PositiveInt, ...] = ()  # Quantiles to publish, percent, such as 10,90; none by default
-    # Accepted false alarms per hour and kind of alarm; 0: no alarms (default)
-    alarms_per_hour: Annotated[float, Range(0, below=1e6)] = 0.0
-    alarms_on: str = ""  # Recordings for setting the thresholds of alarms
-    split: str = ""  # Split whose validation recordings of --alarms-on are used
-
-    @classmethod
-    def override(cls, file_settings: SettingValues, options: SettingValues) -> SettingValues:
-        """Return the settings of a rig file, without its alarms or its split if the options override them."""
-        void: tuple[str, ...] = ()
-        if options.get("alarms_per_hour") == 0:  # the option 0 disables the alarms of the file
-            void = ALARM_KEYS
-        elif "alarms_on" in options and "split" not in options:  # the file's split belongs to the file's recordings
-            void = ("split",)
-        return {name: value for name, value in file_settings.items() if name not in void}
-
-    def check(self, settings: Settings) -> None:
-        """Raise `UsageError` if alarms lack recordings, or recordings or a split lack alarms."""
-        if bool(self.alarms_per_hour) != bool(self.alarms_on):
-            present, absent = ALARM_KEYS[:2] if self.alarms_per_hour else ALARM_KEYS[1::-1]
-            missing = absent if present in settings.places else option(absent)
-            raise UsageError(
-                f"{settings.name_in_errors(present)} also needs {missing}, because thresholds of alarms are set on "
-                "recordings, as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
-            )
-        if self.split and not self.alarms_on:
-            raise UsageError(f"{settings.name_in_errors('split')} has no effect without {option('alarms_on')}.")
 
     def steps_up_to(self, horizon: int) -> tuple[int, ...]:
         """Return the steps to publish. Raises `UsageError` for steps beyond the model's horizon."""
@@ -74,17 +44,16 @@ class ForwardSettings(TaskSettings):
 
 
 class ForwardLive(LiveTask):
-    """Forecasts with alarms at each grid point."""
+    """Forecasts at each grid point."""
 
     settings: ClassVar[type[TaskSettings]] = ForwardSettings
     declaration: ClassVar[Declaration] = DECLARATION
 
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
-        """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans if needed."""
+        """Return the streams of forecasts and latencies, and the rig with a stream of plans if needed."""
         from tacpipe.datasets import model_files
         from tacpipe.live import plans
         from tacpipe.tasks import task
-        from tacpipe.tasks.forward.live.alarms import NAMES
         from tacpipe.tasks.forward.live.stages import refuse_look_ahead
 
         config: ForwardConfig = model_files.tree(
@@ -106,13 +75,9 @@ class ForwardLive(LiveTask):
         forecast: Options = {"channels": config["inputs"]["tactile"], "steps": list(steps), "unit": unit}
         streams: dict[str, Options] = {
             FORECAST: {**forecast, **({"quantiles": list(levels)} if levels else {})},
-            ALARM: {"alarms": list(NAMES)},
             "latency": {},
         }
-        attributes: dict[str, Attribute] = {
-            "live_plan": own_settings.plan,
-            "live_alarms_per_hour": own_settings.alarms_per_hour,
-        }
+        attributes: dict[str, Attribute] = {"live_plan": own_settings.plan}
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
@@ -140,7 +105,6 @@ class ForwardLive(LiveTask):
         engine = ForecastEngine(
             sensors,
             lambda layouts, beginning: open_chain(layouts, beginning=beginning),
-            lambda chain: _alarms(own_settings, model, chain),
             own_settings.steps or None,
             settle_ns=round(settings.settle_ms * 1e6),
             quantiles=own_settings.quantiles,
@@ -186,16 +150,3 @@ class CalibratedLevels:
     """The quantiles for which a model was calibrated."""
 
     percents: tuple[int, ...]
-
-
-def _alarms(own_settings: ForwardSettings, model: Dataset, chain: CausalChain) -> Alarms:
-    """Return the alarms of a session, with thresholds if it has any."""
-    from tacpipe.engine.pipeline import open_dataset
-    from tacpipe.tasks.forward.live.alarms import Alarms, on_recordings
-
-    if not own_settings.alarms_per_hour:
-        return Alarms.unset(chain.layout)
-    recordings = open_dataset(own_settings.alarms_on)
-    if own_settings.split:
-        recordings = recordings.select(split=own_settings.split, role="val")
-    return on_recordings(model, recordings, own_settings.alarms_per_hour)

@@ -111,8 +111,6 @@ class ForwardReport(TaskReport):
             *_channels(context),
             *_ablations(context),
             *skill.band_folds(context),
-            *events.anticipation_folds(context),
-            *events.slip_folds(context),
             *skill.situation_folds(context),
             *events.live_folds(context),
             *representations.representation_folds(context),

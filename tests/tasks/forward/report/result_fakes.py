@@ -115,22 +115,6 @@ def metrics(ratio: Mapping[str, float]) -> dict[str, Any]:
     tree["known"] = _part(ratio, list(KNOWN))
     tree["unseen"] = _part(ratio, [name for name in ratio if name not in KNOWN])
     tree["seen"] = _part({"old": 0.1}, ["old"])
-    tree["anticipation"] = {
-        "model": {
-            "events": 4,
-            "recall": 0.5,
-            "median_lead_rows": 6,
-            "median_lead_frames": 3,
-            "false_alarms_per_minute": 1.0,
-        },
-        "persistence": {
-            "events": 4,
-            "recall": 0.0,
-            "median_lead_rows": None,
-            "median_lead_frames": None,
-            "false_alarms_per_minute": 0.0,
-        },
-    }
     return tree
 
 

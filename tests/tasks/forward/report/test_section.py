@@ -10,7 +10,7 @@ import pytest
 
 from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Section, SmallPrint
-from tacpipe.tasks.forward.report import events, methods, representations
+from tacpipe.tasks.forward.report import methods, representations
 from tacpipe.tasks.forward.report.skill import situation_folds, skill_in_situation
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -161,21 +161,6 @@ def test_a_row_of_table_1_has_mean_and_sd_over_runs_in_the_models_own_space() ->
     (method,) = grouped(methods.read_runs([result(validation={"loss": 0.25, "epoch": 3})]))
     represented = representations.represent_method(method)
     assert represented is not None and represented.validation.mean == 0.25  # the recurrent model's loss is that error
-
-
-def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_coming() -> None:
-    names = ("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
-    rows = [(4, 0.5, 6.0, None, 1), (12, 1.0, 2.0, 1.0, 3), (0, None, None, None, 9)]
-    results = [result(seed=seed) for seed in range(3)]
-    for dataset, row in zip(results, rows, strict=True):
-        content = json.loads(dataset.files["metrics.json"])
-        content["anticipation"] = {"model": dict(zip(names, row, strict=True))}
-        dataset.files["metrics.json"] = json.dumps(content).encode()
-    (method,) = grouped(methods.read_runs(results))
-    assert events.anticipation_scores(method, "model") == pytest.approx(
-        dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True))
-    )
-    assert events.anticipation_scores(method, "ridge") is None
 
 
 def test_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
