@@ -1,7 +1,7 @@
 """BioTac slides: made-up ones with each fault of the files, and the published ones where they are at hand."""
 
-import os
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +11,12 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.biotac_slide import biotac_slide, discover
 from tacpipe.formats.published import Params
-from tacpipe.plugins.stage import RecordingOutput
-from tests.formats.builders import edit
+from tests.conftest import sample_data
+from tests.formats.builders import edit, read_single
 from tests.formats.slide_files import SECOND, write_biotac
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
-
-
-def read(source: Path, params: Params | None = None) -> RecordingOutput:
-    params = params or Params()
-    (files,) = discover(params, source).values()
-    recording = biotac_slide(params, files)
-    assert isinstance(recording, RecordingOutput)
-    return recording
+SAMPLE = sample_data()
+read = partial(read_single, biotac_slide, discover)
 
 
 def values(table: pa.Table) -> np.ndarray:

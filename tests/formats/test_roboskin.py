@@ -1,6 +1,5 @@
 """RoboSkin slides: made-up blocks in every arrangement, and the published ones where they are at hand."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,10 @@ from hypothesis.extra import numpy as hnp
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.roboskin import Params, discover, is_time, lag_one, roboskin, scramble, unscramble
 from tacpipe.plugins.stage import RecordingOutput
+from tests.conftest import sample_data
 from tests.formats.slide_files import touched, write_roboskin
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 
 
 def read(source: Path, params: Params | None = None) -> dict[str, RecordingOutput]:

@@ -1,8 +1,8 @@
 """The flat object set: made-up trials with each of its faults, and the published ones where they are at hand."""
 
-import os
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +12,15 @@ from scipy.spatial.transform import Rotation
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params
 from tacpipe.formats.xela_flat import discover, xela_flat
-from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.signals.kinematics import PANDA, rotates_with_hand
+from tests.conftest import sample_data
 from tests.formats import xela_files
-from tests.formats.builders import edit
+from tests.formats.builders import edit, read_single
 from tests.signals.test_kinematics import elementary
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 Trial = Callable[..., Path]
-
-
-def read(folder: Path, params: Params | None = None) -> RecordingOutput:
-    params = params or Params()
-    (files,) = discover(params, folder).values()
-    recording = xela_flat(params, files)
-    assert isinstance(recording, RecordingOutput)
-    return recording
+read = partial(read_single, xela_flat, discover)
 
 
 def drop_rows(path: Path, count: int) -> None:

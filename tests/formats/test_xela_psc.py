@@ -1,7 +1,7 @@
 """The slip control set: made-up trials with each of its faults, and the published ones where they are at hand."""
 
-import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +12,12 @@ from scipy.spatial.transform import Rotation
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params
 from tacpipe.formats.xela_psc import discover, xela_psc
-from tacpipe.plugins.stage import RecordingOutput
+from tests.conftest import sample_data
+from tests.formats.builders import read_single
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 Trial = Callable[..., Path]
-
-
-def read(folder: Path) -> RecordingOutput:
-    (files,) = discover(Params(), folder).values()
-    recording = xela_psc(Params(), files)
-    assert isinstance(recording, RecordingOutput)
-    return recording
+read = partial(read_single, xela_psc, discover)
 
 
 def set_cell(path: Path, row: int, column: str, cell: str) -> None:

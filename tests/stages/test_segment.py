@@ -1,8 +1,6 @@
 """Test contacts and slips of constructed, simulated and, where they are at hand, published recordings."""
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +12,10 @@ from tacpipe.io import columns
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.params import from_json, to_json
 from tacpipe.plugins.registry import load
+from tests.conftest import sample_data
 from tests.fake_recordings import decode_few_rows_at_a_time
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 segment = load("segment.contacts")
 slips = load("segment.slips")
 synchronize = load("synchronize")

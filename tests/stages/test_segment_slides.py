@@ -1,8 +1,6 @@
 """Test slides cut from constructed recordings, synchronized or not, and from published ones where they are at hand."""
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +11,10 @@ from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
+from tests.conftest import sample_data
 from tests.stages.slide_fakes import START_NS, drawn, finger, pressed, replaced
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 slides = load("segment.slides")
 synchronize = load("synchronize")
 Recording = Callable[..., Any]

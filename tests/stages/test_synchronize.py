@@ -1,9 +1,7 @@
 """Test streams on one clock: values, types, masks and refusals."""
 
-import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +19,10 @@ from tacpipe.plugins.params import from_json, to_json
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.synchronization import streams as grids
+from tests.conftest import sample_data
 from tests.fake_recordings import FakeRecording
 
-SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
+SAMPLE = sample_data()
 T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
 synchronize, contacts = load("synchronize"), load("segment.contacts")
