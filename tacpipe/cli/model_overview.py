@@ -154,7 +154,7 @@ def model_text(value: ModelOverview) -> list[str]:
 
 
 def _summary(value: ModelOverview) -> str:
-    """Return architecture, task, epochs and the best epoch on one line."""
+    """Return architecture, task, number of epochs and validation result on one line, without those that are missing."""
     parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
     if value["epochs"]:
         parts.append(headline.format_count(value["epochs"], "epochs"))

@@ -137,7 +137,7 @@ class StageProcesses:
 
 
 def _run(command: str | list[str], folder: str, variables: dict[str, str], *output_paths: str) -> None:
-    """Run one command in this forked process, in the folder ``place``, with its output in the files ``output_paths``."""
+    """Run one command in this forked process, in ``folder``, with its output in ``output_paths``."""
     os.environ.update(variables)
     for target, path in enumerate(output_paths, 1):
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)

@@ -194,7 +194,7 @@ def reader(
 
 
 def _adopt(store: Store, name: str, path: str, dataset_dirs: tuple[str, ...], size: int | None) -> bytes | None:
-    """Return an intact copy of an object from ``beside_of``, and store it; None if there is no copy."""
+    """Return an intact copy of an object from ``dataset_dirs``, and store it; None if there is no copy."""
     content = paths.verified_copy(name, path, dataset_dirs, size)
     if content is not None:
         with contextlib.suppress(TacpipeError):  # a read-only store stays damaged; the intact copy is used

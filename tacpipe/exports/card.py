@@ -179,7 +179,7 @@ class Params:
     creators: Names = ""  # people who recorded it
     url: str = ""  # address of the publication
     published: str = ""  # date, ISO 8601
-    cite_as: str = ""  # how to cite it
+    cite_as: str = ""  # full citation
 
 
 @stage(version=2)

@@ -221,7 +221,7 @@ def _read_slide(path: Path, index: int) -> Float32s:
 
 
 def _read_label(block: Path, path: Path, index: int) -> int:
-    """Return the label of slide ``place`` of a block, from 0; ``path`` has one label per slide.
+    """Return the label of slide ``index`` (from 0) of a block; ``path`` has one label per slide.
 
     Raises `TacpipeError` if the labels are not one integer per slide.
     """

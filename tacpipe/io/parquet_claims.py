@@ -267,7 +267,11 @@ def _list(content: Bytes, offset: int, stop: int, depth: int) -> tuple[list[Any]
 
 
 def _read_common_form(content: Bytes, offset: int, stop: int) -> tuple[dict[int, Any], int] | None:
-    """Return the needed fields and the end of a footer structure in the common form, or None for other forms."""
+    """Return the needed fields by Thrift number and the end of a footer structure; None if it is not in the common form.
+
+    Of a column chunk, these are the metadata (3) with the number of values (5), the size (7) and the offset of the first
+    page (9). No field of schema elements and column orders is needed.
+    """
     first_byte = content[offset] if offset < stop else 0
     if first_byte == _CHUNK and (chunk := _USUAL_CHUNK.match(content, offset, stop)) and len(chunk[2]) == chunk[1][0]:
         return {3: {5: _varint(chunk[3]), 7: _varint(chunk[5]), 9: _varint(chunk[6])}}, chunk.end()

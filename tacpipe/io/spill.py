@@ -154,7 +154,7 @@ def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: 
 
 
 def _rows_below(remaining: list[tuple[int, pa.Table]], order: str, limit: float | None) -> Iterator[pa.Table]:
-    """Yield the rows below ``limit``, or all for None, as one table sorted by ``order``; keep the others in ``waiting``."""
+    """Yield the rows below ``limit`` (None: all) as one table sorted by ``order``, and keep the others in ``remaining``."""
     ready: list[pa.Table] = []
     not_ready: list[tuple[int, pa.Table]] = []
     for position, table in sorted(remaining, key=lambda entry: entry[0]):

@@ -88,8 +88,8 @@ class Loop:
         self.connection, self.engine, self.publishers, self.blocks = connection, engine, publishers, blocks
         self.latencies = Latencies()
         self.forecasts = 0
-        self.cause = ""
-        self._reported_ns = 0
+        self.cause = ""  # the reason why the latest message has no prediction
+        self._reported_ns = 0  # monotonic time of the last report
         self._reported: Continuation | None = None  # the continuation state reported last
         self._ended = False
 

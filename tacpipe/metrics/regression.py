@@ -53,10 +53,10 @@ def mae(true: AnyFloats, predicted: AnyFloats) -> float:
 
 
 def r2(true: AnyFloats, predicted: AnyFloats) -> float:
-    """Return the explained fraction of variance, with each value's variance about its own mean; NaN if nothing varies.
+    """Return the explained fraction of the variance of ``true`` (row, value), summed over values; NaN if nothing varies.
 
-    1 is perfect; 0 equals the mean of these grasps, which is unknown in advance: a constant fitted elsewhere is below
-    it.
+    1 is perfect, and 0 is as good as predicting the mean of each value. That mean is unknown in advance, so a constant
+    that was fitted to other rows has a score below 0.
     """
     error, spread = _sums_by_value(true, predicted)
     return _explained_fraction(error.sum(), spread.sum())

@@ -41,7 +41,7 @@ class CounterUnroller:
 
     def __init__(self, modulus: int, rate_hz: float, step: int = 1) -> None:
         self.modulus, self.rate_hz, self.step = modulus, rate_hz, step
-        # highest count as sent, the same unrolled, and its arrival in ns
+        # the highest count as sent and unwrapped, and its arrival time in ns
         self._last: tuple[int, int, int] | None = None
         # The last count before a reset and the size of the jump: a single wrong count looks like a reset.
         self._before_reset: tuple[int, int] | None = None

@@ -30,7 +30,7 @@ class Biquad:
         second_state = (b2 - a2 * gain) * first
         first_state = (b1 - a1 * gain) * first + second_state
         filtered = []
-        for value in values.tolist():  # in a recursion, Python floats are faster than those of numpy
+        for value in values.tolist():  # Python floats are faster than numpy scalars here
             smooth = b0 * value + first_state
             first_state = b1 * value - a1 * smooth + second_state
             second_state = b2 * value - a2 * smooth

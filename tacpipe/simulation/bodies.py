@@ -43,7 +43,7 @@ class Shape(Protocol):
         """Return the outward unit normals at points of the surface (point, xyz)."""
 
     def bending(self, at_m: Floats) -> Floats:
-        """Return the curvature matrix B at points of the surface (point, xyz, xyz), in 1/m."""
+        """Return the curvature matrix at points of the surface (point, xyz, xyz), in 1/m."""
 
     def margin_m(self, at_m: Floats) -> Floats:
         """Return the distance of each point of the surface from the nearest edge (point,) in metres; inf without edges."""
@@ -53,7 +53,10 @@ class Shape(Protocol):
 
 
 def principal_curvatures(bending: Floats, normal: Floats) -> Floats:
-    """Return the principal curvatures (point, 2) in 1/m, ascending, from B (point, xyz, xyz) and normals (point, xyz)."""
+    """Return the principal curvatures (point, 2) in 1/m, ascending; they are positive on a sphere.
+
+    ``bending`` are curvature matrices (point, xyz, xyz) in 1/m (`Shape.bending`), and ``normal`` unit normals (point, xyz).
+    """
     helper = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

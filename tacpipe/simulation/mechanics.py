@@ -121,7 +121,7 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     damping = 2 * math.sqrt(STIFFNESS_N_M * mass)
     yielding = 1 / (1 + rate * damping + rate * step_s * STIFFNESS_N_M)
     limits, rises = grasp.limit_n, np.ones(rows) if rise_m is None else rise_m
-    sx = sz = vx = vz = 0.0  # displacement by slip and relative velocity
+    sx = sz = vx = vz = 0.0  # displacement (x, z) by slip, and relative velocity (x, z)
     borne = min(max(float(rises[first]) / TABLE_M, 0.0), 1.0)
     ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
     ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * borne / STIFFNESS_N_M

@@ -171,8 +171,9 @@ class Look:
     def unchanged(self) -> bool:
         """Return whether the directory has the same names and files as at the start of the check."""
         with contextlib.suppress(OSError, TacpipeError):
-            if self._settled_states()(self._directory_state) is not None:
-                return _state(self._directory) == self._directory_state
+            settled_state = self._settled_states()(self._directory_state)
+            if settled_state is not None:  # otherwise the folder may have changed again without a new time
+                return _state(self._directory) == settled_state
         return _inodes(self._directory) == self.inodes
 
     def holds(self, note: Note, *, listed: bool = False) -> bool:

@@ -321,7 +321,7 @@ def read_transposed(tree: Tree, array: ArrayDescription, start: int, stop: int) 
 
 
 def _compound_columns(prefix: str, values: AnyArray, array: ArrayDescription) -> Iterator[tuple[pa.Field, pa.Array]]:
-    """Yield field and values of each column of a compound array; names of nested fields start with ``before``."""
+    """Yield field and values of each column of a compound array; names of nested fields start with ``prefix``."""
     for name in values.dtype.names or ():
         inner = values[name]
         if inner.dtype.names is not None:

@@ -193,7 +193,7 @@ class LeRobotDescription:
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
     def _format_path(self, key: str, default: str, values: Mapping[str, str | int | None]) -> str:
-        """Return a path in the dataset from a pattern in info.json, by default ``usual``.
+        """Return a path in the dataset from a pattern in info.json, or from ``default``.
 
         Raises `TacpipeError` if the pattern contains an unknown name.
         """

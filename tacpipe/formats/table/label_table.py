@@ -184,7 +184,7 @@ def _find_key_column(
 
 
 def _label_row(path: Path, place: str, key: str, row: Mapping[str, Cell], is_text: bool) -> LabelRow:
-    """Return a row of labels; ``place`` describes it in errors, and cells of a text table (``texts``) are parsed.
+    """Return a row of labels; ``place`` describes it in errors, and cells of a text table (``is_text``) are parsed.
 
     Raises `TacpipeError` if the row has no name or an invalid label.
     """

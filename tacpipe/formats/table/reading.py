@@ -247,7 +247,7 @@ def _batches(
             stream, [name for name in names if name not in reserved_names], path, declared
         )
         types = {**rows.reserved_types(file, stream), **{column.name: column.read_as for column in chosen_columns}}
-        allows_non_finite = bool(declared)  # NaN and infinity in a container are values
+        allows_non_finite = bool(declared)  # only containers declare columns; their NaN and infinity are valid
         blocks = (
             _convert_block(stream, block, chosen_columns, place, allows_non_finite)
             for block, _, place in rows.row_blocks(file, stream, types, recording, shared)

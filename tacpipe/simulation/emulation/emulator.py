@@ -81,12 +81,12 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
 
 
 def _udp(stream: RigStream) -> Endpoint:
+    """Return the endpoint of a UDP stream, which sends to a free port if the host listens there."""
     from tacpipe.simulation.emulation.network import HOST, Udp, free_port
 
-    host, _, _ = stream.address.target.partition("?")[0].rpartition(":")
-    if stream.sensor.listens or not host:
-        return Udp(stream.sensor, (HOST if host else "", free_port()))
-    return Udp(stream.sensor)
+    host = stream.address.target.partition("?")[0].rpartition(":")[0]
+    host_listens = stream.sensor.listens or not host
+    return Udp(stream.sensor, (HOST if host else "", free_port()) if host_listens else None)
 
 
 def _device(folder: Path, name: str) -> Path:

@@ -160,6 +160,7 @@ class Pty:
         with contextlib.suppress(BlockingIOError):
             count = os.write(self._master, b"".join(wire_bytes))
         sizes = sent_sizes([len(piece) for piece in wire_bytes], count)
+        # in bytes of the pieces, which differ from those on the wire; an incomplete piece lacks at least its last byte
         return [
             len(piece) if size == len(sent) else min(size, len(piece) - 1)
             for piece, sent, size in zip(pieces, wire_bytes, sizes, strict=True)

@@ -97,7 +97,7 @@ class Forecaster:
 
     @property
     def pose(self) -> Pose:
-        """The arm columns that it was trained on, or None if it was trained without an arm."""
+        """The arm columns that it was trained on; `DEFAULT_POSE` if its configuration does not name them."""
         stored_pose = self.config["inputs"].get("pose")
         return (
             DEFAULT_POSE

@@ -274,7 +274,10 @@ class FingerReader:
         return [*windows, sample_ahead(track.plans, track.t_ns[rows])] if self.reads_plans else windows
 
     def window_features(self, windows: Sequence[AnyFloats]) -> Floats:
-        """Return the features (window, feature) of `windows`."""
+        """Return the features (window, feature) of `windows`: of each finger, then of the plan.
+
+        If windows have one row, the features are the channels of that row.
+        """
         touch = windows[: len(self.fingers)]
         if self._reads_rows:
             features: Floats = np.concatenate([part[:, -1] for part in touch], axis=1)

@@ -64,7 +64,10 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
 
 
 def measure(range_counts: float, cluster: str) -> Measure:
-    """Return the conversion of sums of squares and numbers of values to errors, for a target with this range."""
+    """Return the RMSE of a target as a `Measure`, in fractions of its range of ``range_counts`` and in counts.
+
+    Its sums (draw, 2) are sums of squared errors and numbers of values; ``cluster`` names what is resampled.
+    """
 
     def rmse(sums: AnyFloats) -> AnyFloats:
         return np.sqrt(np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1), np.nan))

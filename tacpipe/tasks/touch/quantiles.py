@@ -161,7 +161,7 @@ def _sums(
     mask: Bools,
     clusters: np.ndarray[Any, np.dtype[np.str_]],
 ) -> list[Sums]:
-    """Return the sums over the values of each cluster of grasps, for a predictor and target, ``about``."""
+    """Return the sums over the values of each cluster of grasps, for a predictor and target."""
     predictor, target = predictor_and_target
     bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
     truth = grasps.readings[target][mask]

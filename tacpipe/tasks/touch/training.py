@@ -194,9 +194,10 @@ def _best_leaf_size(rows: Floats, values: Floats, params: Trees) -> int:
 
 
 def _add_networks(params: PointNetwork, grasps: TrainingGrasps, model: FittedModel) -> None:
-    """Add networks to ``model``, ``networks`` of each: one for all targets, or one per target.
+    """Train the networks of ``params`` for all targets, or for each, and add them with their history to ``model``.
 
-    Raises `TacpipeError` if validation grasps are needed and missing.
+    Without validation grasps, their error is measured on the training grasps. Raises `TacpipeError` if validation grasps
+    are needed and missing.
     """
     training, validation, targets = grasps.training, grasps.validation, grasps.targets
     if validation is None and params.chooses_by_validation:
