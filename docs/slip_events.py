@@ -1,13 +1,15 @@
 """Measure alarms by what happens to the object: ``python docs/slip_events.py DATA --models M… --results R…``.
 
 ``DATA`` is a dataset of simulated trials with the label ``handling`` (``simulate forward --handling mixed``). Models and
-results are those of the folds of ``train slip`` and ``evaluate``. The script prints tables of ``docs/benchmarks/slip.md``.
+results are those of the folds of ``train slip`` and ``evaluate``. Trials of objects that a model has seen are left out. The
+script prints tables of ``docs/benchmarks/slip.md``.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +36,7 @@ CONTRASTS = {  # windows before a slip of these handlings, against stable contac
 def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterator[str]:
     """Yield the lines of the tables."""
     recordings = tacpipe.open(data).recordings
-    parts = [EvaluatedSlips.from_result(tacpipe.open(path)) for path in results]
+    parts = [read_unseen(path) for path in results]
     pooled = parts[0].pooled(parts[1:])
     handling = {name: str(recording.attributes["handling"]) for name, recording in recordings.items()}
     yield "| windows | before the slip | during the slip | time only, before |"
@@ -45,7 +47,11 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
         cells = [areas[0]["before"], areas[0]["during"], areas[1]["before"]]
         yield f"| {name} | " + " | ".join(map(estimate_text, cells)) + " |"
     yield ""
-    heads = [f"{text} (level {rate})" for rate in RATES for text in ("false alarms per minute", "slips predicted")]
+    heads = [
+        f"{text} (level {rate})"
+        for rate in RATES
+        for text in ("false alarms per minute", "slips predicted, median lead")
+    ]
     yield "| handling | trials | minutes of stable contact | " + " | ".join(heads) + " |"
     yield "| --- " * (3 + len(heads)) + "|"
     for kind in sorted(set(handling.values())):
@@ -54,7 +60,8 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
         cells_of_kind = [f"{len(tracks)}", f"{scores[0]['minutes']:.1f}"]
         for score in scores:
             cells_of_kind.append(f"{score['false_alarms_per_minute'] or 0:.1f}")
-            cells_of_kind.append(f"{score['predicted']} of {score['events']}" if score["events"] else "")
+            lead = "" if score["median_lead_ms"] is None else f", {score['median_lead_ms']:.0f} ms"
+            cells_of_kind.append(f"{score['predicted']} of {score['events']}{lead}" if score["events"] else "")
         yield f"| {kind} | " + " | ".join(cells_of_kind) + " |"
     yield ""
     for rate in RATES:
@@ -65,6 +72,13 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
             if handling[track.name] == "release"
         ]
         yield f"At level {rate}, {sum(alarms)} of {len(alarms)} releases have an alarm while the gripper opens."
+
+
+def read_unseen(path: Path) -> EvaluatedSlips:
+    """Return the evaluation of recordings with objects that the model was not trained on."""
+    result = tacpipe.open(path)
+    evaluated, seen = EvaluatedSlips.from_result(result), json.loads(result.files["config.json"])["objects"]
+    return select(evaluated, [track.object not in seen for track in evaluated.tracks])
 
 
 def select(evaluated: EvaluatedSlips, chosen: Sequence[bool]) -> EvaluatedSlips:
@@ -124,7 +138,7 @@ def draw(path: Path, data: Path, models: Sequence[Path], results: Sequence[Path]
     from matplotlib import pyplot
 
     recordings = tacpipe.open(data).recordings
-    parts = [EvaluatedSlips.from_result(tacpipe.open(result)) for result in results]
+    parts = [read_unseen(result) for result in results]
     figure, grid = pyplot.subplots(3, len(SHOWN), figsize=(13, 6.5), sharex=True, sharey="row", layout="constrained")
     for column, (kind, title) in enumerate(SHOWN.items()):
         fold, name = next(
