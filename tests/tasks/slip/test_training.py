@@ -189,3 +189,9 @@ def test_the_rule_reads_the_forecasts_of_a_forward_model(tmp_path: Path) -> None
         if name.startswith("xela1") and name.endswith("_x_t5"):  # the shear rises five steps ahead and falls later
             table = table.set_column(place, table.schema.field(place), pa.array(table[name].to_numpy() + 1000))
     assert (score_forecasts(table) > 0.1).all()
+    rule = ForecastRule(forward_model=str(tmp_path / "forward"), streams="xela*")
+    files = training.train(rule, tacpipe.open(tmp_path / "raw"), None, tmp_path / "workspace")
+    assert SlipModel.load(files).scorer.describe()["forward_digest"] == rule.forward_digest
+    commands.run(tmp_path, [lines[-1].replace("--epochs 1", "--epochs 1 --seed 1")])
+    with pytest.raises(TacpipeError, match="has the digest"):
+        SlipModel.load(files)
