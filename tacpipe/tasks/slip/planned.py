@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 STEP_NS, POINTS = 20_000_000, 50  # times after a row at which a plan is sampled: one second
 SMALLEST_STEP_NS = 10_000_000  # time between two points of a plan below which the later one is left out
 GRAVITY_M_S2 = 9.81
-CHANNELS = ("load", "acceleration", "speed")  # of a sampled plan: |a + g| / g with z upwards, |a| / g, and m/s
+# channels of a sampled plan: |a + g| / g with z upwards, |a| / g, and the speed in m/s
+CHANNELS = ("load", "acceleration", "speed")
 SPANS_S = (0.1, 0.2, 0.5, 1.0)  # times after a row up to which the largest value is a feature
 
 NAMES_OF_PLAN = (
