@@ -6,6 +6,7 @@ nearest sample; linear interpolation does more, and what does the same in pandas
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,14 @@ class Decoded:
     def __getattr__(self, name: str) -> Any:
         return getattr(self.table, name)
 
-    def forget(self) -> None:
-        """Keep them: what is timed is no decoding."""
+    @property
+    def row_bytes(self) -> int:
+        """The size of a row in bytes."""
+        return int(self.table.nbytes // max(1, self.table.num_rows))
+
+    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Yield all rows at once."""
+        yield self.table if columns is None else self.table.select(list(columns))
 
 
 @dataclass(frozen=True)
