@@ -269,9 +269,11 @@ def draw_scores(rng: np.random.Generator, objects: int, models: Sequence[ScoreMo
                 part.append(values + (states[-1] == BEFORE) * (model.effect + model.effect_sd * effect))
         all_states = np.concatenate(states)
         t_ns, no_event = np.arange(len(all_states)) * 100_000_000, np.zeros((0, 2), np.int64)
-        for part, values_of_object in zip(tracks, scores, strict=True):
+        for tracks_of_model, values_of_object in zip(tracks, scores, strict=True):
             joined, weights = np.concatenate(values_of_object), np.ones(len(all_states))
-            part.append(ScoredTrack(str(number), str(number), t_ns, all_states, joined, no_event, weights, t_ns / 1e9))
+            tracks_of_model.append(
+                ScoredTrack(str(number), str(number), t_ns, all_states, joined, no_event, weights, t_ns / 1e9)
+            )
     return tracks
 
 

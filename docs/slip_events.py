@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,9 +75,8 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
 
 def read_unseen(path: Path) -> EvaluatedSlips:
     """Return the evaluation of recordings with objects that the model was not trained on."""
-    result = tacpipe.open(path)
-    evaluated, seen = EvaluatedSlips.from_result(result), json.loads(result.files["config.json"])["objects"]
-    return select(evaluated, [track.object not in seen for track in evaluated.tracks])
+    evaluated = EvaluatedSlips.from_result(tacpipe.open(path))
+    return select(evaluated, [track.object not in evaluated.known_objects for track in evaluated.tracks])
 
 
 def select(evaluated: EvaluatedSlips, chosen: Sequence[bool]) -> EvaluatedSlips:

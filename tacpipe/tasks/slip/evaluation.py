@@ -72,9 +72,9 @@ class EvaluatedSlips:
     tracks: tuple[ScoredTrack, ...]  # with the scores of the model
     scores: Mapping[str, tuple[Floats, ...]]  # predictor -> recording -> (row,)
     probabilities: Mapping[str, tuple[Floats, ...]]
-    levels: Mapping[
-        str, Mapping[str, Mapping[str, float]]
-    ]  # recording -> predictor -> false alarms per minute -> level
+    # recording -> predictor -> false alarms per minute -> level
+    levels: Mapping[str, Mapping[str, Mapping[str, float]]]
+    known_objects: frozenset[str] = frozenset()  # objects of the recordings that the model was trained on
 
     @classmethod
     def from_windows(
@@ -94,9 +94,17 @@ class EvaluatedSlips:
         return cls(tracks, split(scores), split(probabilities), {track.name: levels for track in tracks})
 
     def pooled(self, others: Sequence[EvaluatedSlips]) -> EvaluatedSlips:
-        """Return this evaluation with those of further folds, matched for time again."""
-        parts = [self, *others]
-        tracks = [track for part in parts for track in part.tracks]
+        """Return this evaluation with those of further folds, matched for time again.
+
+        A recording that several folds test (``split --apart object``) counts once, in a fold that did not train on its
+        object if there is one.
+        """
+        parts: dict[str, tuple[EvaluatedSlips, int]] = {}  # recording -> the fold that counts, and its index there
+        for part in (self, *others):
+            for index, track in enumerate(part.tracks):
+                if track.name not in parts or track.object not in part.known_objects:
+                    parts[track.name] = (part, index)
+        tracks = [part.tracks[index] for part, index in parts.values()]
         since_s, slips = (
             np.concatenate([np.zeros(0), *values])
             for values in ([track.since_s for track in tracks], [track.states > STABLE for track in tracks])
@@ -106,9 +114,12 @@ class EvaluatedSlips:
         matched = [replace(track, weights=own) for track, own in zip(tracks, np.split(weights, ends), strict=True)]
 
         def join(column: str) -> dict[str, tuple[Floats, ...]]:
-            return {name: tuple(row for part in parts for row in getattr(part, column)[name]) for name in self.scores}
+            return {
+                name: tuple(getattr(part, column)[name][index] for part, index in parts.values())
+                for name in self.scores
+            }
 
-        levels = {name: by_predictor for part in parts for name, by_predictor in part.levels.items()}
+        levels = {name: part.levels[name] for name, (part, _) in parts.items()}
         return EvaluatedSlips(tuple(matched), join("scores"), join("probabilities"), levels)
 
     def scored_by(self, predictor: str) -> list[ScoredTrack]:
@@ -219,7 +230,8 @@ class EvaluatedSlips:
             return {name: tuple(values[f"{prefix}_{name}"][place] for place in places) for name in predictors}
 
         levels = {name: own["levels"] for name, own in described.items()}
-        return cls(tuple(tracks), column("score"), column("probability"), levels).pooled([])
+        known = frozenset(model_files.tree(result.files, model_files.CONFIG, {"objects": list})["objects"])
+        return cls(tuple(tracks), column("score"), column("probability"), levels, known).pooled([])
 
 
 def brier_measure() -> Measure:

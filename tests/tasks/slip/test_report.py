@@ -55,6 +55,17 @@ def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[An
     assert all(len(row.cells) == len(ALARM_HEADS) + 1 for row in alarms.rows)
 
 
+def test_a_recording_that_two_folds_test_counts_where_its_object_is_new(results: list[Any]) -> None:
+    evaluated = evaluation.EvaluatedSlips.from_result(results[0])
+    objects = frozenset(track.object for track in evaluated.tracks)
+    trained = dataclasses.replace(
+        evaluated, known_objects=objects, levels={track.name: {} for track in evaluated.tracks}
+    )
+    for pooled in (trained.pooled([evaluated]), evaluated.pooled([trained])):
+        assert len(pooled.tracks) == len(evaluated.tracks)
+        assert pooled.levels == evaluated.levels
+
+
 def test_the_report_needs_no_torch(tmp_path: Path) -> None:
     from tests.conftest import run_python
 
