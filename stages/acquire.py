@@ -25,7 +25,10 @@ DRY_RUN_S = 3.0
 
 
 def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
-    """Record the trials of a plan. Returns the recordings, and a message for each stream that was lost."""
+    """Record the trials of a plan. Returns the recordings, and a message for each stream that was lost.
+
+    Raises `UsageError` for invalid options, and `DeviceError` if streams do not open or send nothing.
+    """
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, trials, triggers
@@ -58,7 +61,7 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
 
 
 def recover(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Complete the recordings from spools of earlier processes of this user.
+    """Complete the recordings from spools of earlier processes of this user, and report those that cannot be completed.
 
     Returns the recordings, and the number of spools that could not be completed.
     """

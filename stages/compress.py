@@ -62,7 +62,7 @@ class AutoencoderParams:
     PRESETS: ClassVar[Presets] = {"quick": {"epochs": 5}}
 
     def check(self) -> None:
-        """Raise an error for hidden layers together with a search, which chooses its own widths."""
+        """Raise `UsageError` for hidden layers together with a search, which chooses its own widths."""
         if self.search and self.hidden:
             raise UsageError(
                 f"hidden is {self.hidden} and search is {self.search}, which chooses its own widths; give only one of them."
@@ -138,7 +138,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
 
 
 def _latent_count(components: int, channels: int) -> tuple[int, list[str]]:
-    """Return the number of latents, with a note if there are fewer channels than requested latents."""
+    """Return the number of latents, and a list with a note if there are fewer channels than requested latents."""
     if components <= channels:
         return components, []
     return channels, [

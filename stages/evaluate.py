@@ -60,6 +60,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
 
 
 def _evaluate_sessions(task: Task, model: Model, recordings: Dataset) -> Result:
+    """Return the evaluation of live sessions. Raises `UsageError` if models of the task do not run live."""
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
 

@@ -47,7 +47,7 @@ class Params(StreamSelection):
     reference_frames: PositiveInt = 5  # number of first frames whose mean is the untouched gel
 
     def check(self) -> None:
-        """Raise an error for a grid with more cells than a table should have columns."""
+        """Raise `UsageError` for a grid with more cells than a table should have columns."""
         if self.rows * self.columns > MAX_CELLS:
             raise UsageError(
                 f"A grid of {self.rows} x {self.columns} cells has more than {MAX_CELLS:,}. Choose fewer rows or columns."
@@ -74,7 +74,7 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
                 f"{params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
             )
         channels = DifferenceChannels(params.rows, params.columns, params.reference_frames)
-        return _stream(columns, channels.fields(), _channel_values(columns, video_format, channels))
+        return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
 
@@ -89,7 +89,7 @@ class MarkerParams(StreamSelection):
     pitch_mm: Annotated[NonNegativeFloat, Unit("mm")] = 0.0
 
     def check(self) -> None:
-        """Raise an error for a grid with more markers than a table should have columns."""
+        """Raise `UsageError` for a grid with more markers than a table should have columns."""
         if self.rows * self.columns > MAX_CELLS:
             raise UsageError(
                 f"A grid of {self.rows} x {self.columns} markers has more than {MAX_CELLS:,}. Choose fewer rows or columns."
@@ -112,7 +112,7 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
 
     def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
         channels = MarkerChannels(params.rows, params.columns, params.pitch_mm, place)
-        return _stream(columns, channels.fields(), _channel_values(columns, video_format, channels))
+        return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
 
@@ -132,7 +132,10 @@ class FrameAutoencoderParams(StreamSelection):
 
 @stage(version=1)
 def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
-    """Return the weights of an encoder trained on images of the training recordings."""
+    """Return the weights of an encoder trained on images of the training recordings.
+
+    Raises `TacpipeError` if there are fewer than two, or no frames.
+    """
     from tacpipe.codecs import frame_autoencoder
     from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
@@ -183,7 +186,10 @@ class EncoderParams(StreamSelection):
     weights_sha256: str = ""  # sha256 of that file; computed if omitted
 
     def __post_init__(self) -> None:
-        """Compute the digest of the weights, which is part of the key."""
+        """Compute the digest of the weights, which is part of the key.
+
+        Raises `UsageError` if it differs from the stated one.
+        """
         if not self.weights:
             return
         digest = _sha256(self.weights)
@@ -215,7 +221,10 @@ def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
 def _replace_frames(
     recording: Recording, compute: Callable[[str, Columns, VideoFormat], pa.RecordBatchReader]
 ) -> RecordingOutput:
-    """Return a recording with its streams of frames replaced by ``compute``, whose first argument is the name for errors."""
+    """Return a recording with its streams of frames replaced by ``compute``, whose first argument is the name for errors.
+
+    Raises `TacpipeError` if there is no such stream.
+    """
     from tacpipe.video.stream import read_format
 
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
@@ -244,7 +253,9 @@ def _copy_stream(columns: Columns) -> pa.RecordBatchReader:
     return pa.RecordBatchReader.from_batches(columns.schema, batches)
 
 
-def _stream(columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]) -> pa.RecordBatchReader:
+def _stream_of_values(
+    columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]
+) -> pa.RecordBatchReader:
     """Return a lazy stream with the clocks of ``columns`` and the ``values``, pairs of row number and values (field,)."""
     import pyarrow as pa
 
@@ -283,40 +294,37 @@ def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[i
 
 
 def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]:
-    """Return about ``count`` downscaled images from all streams of frames, by recording (image, row, column, rgb)."""
+    """Return about ``count`` downscaled images from all streams of frames, by recording (image, row, column, rgb).
+
+    Raises `TacpipeError` if there are no frames.
+    """
     from tacpipe.codecs.frame_autoencoder import reduce_image
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import read_format
 
-    streams = [
-        [
-            (columns, video_format)
-            for name in recording.streams
-            if (video_format := read_format(columns := recording.columns(name)))
-        ]
-        for recording in recordings
-    ]
+    streams: list[list[tuple[Columns, VideoFormat]]] = []  # by recording
+    for recording in recordings:
+        formats = [(columns, read_format(columns)) for columns in map(recording.columns, recording.streams)]
+        streams.append([(columns, video_format) for columns, video_format in formats if video_format])
     total = sum(columns.num_rows for parts in streams for columns, _ in parts)
     if not total:
         raise TacpipeError("The training recordings have no frames. Give the recordings of a camera.")
     step = max(1, total // count)
-    return [
-        np.array(
-            [
-                reduce_image(image)
-                for columns, video_format in parts
-                for row, image in decode_frames(video_format, read_batches(columns))
-                if row % step == 0
-            ],
-            np.uint8,
-        )
-        for parts in streams
-        if parts
-    ]
+    images = []
+    for parts in filter(None, streams):
+        reduced = []
+        for columns, video_format in parts:
+            frames = decode_frames(video_format, read_batches(columns))
+            reduced += [reduce_image(image) for row, image in frames if row % step == 0]
+        images.append(np.array(reduced, np.uint8))
+    return images
 
 
 def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode) -> pa.RecordBatchReader:
-    """Return the features of a stream of frames, with its clocks. The first batch determines the number of features."""
+    """Return the features of a stream of frames, with its clocks. The first batch determines the number of features.
+
+    Raises `TacpipeError`, also while it is read, if the encoder returns another shape.
+    """
     from tacpipe.video.decoding import decode_frames, read_batches
 
     def features() -> Iterator[tuple[int, AnyFloats]]:
@@ -334,7 +342,7 @@ def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode)
     values = features()
     head = list(itertools.islice(values, 1))
     width = len(head[0][1]) if head else 0
-    return _stream(columns, _feature_fields(width), itertools.chain(head, values))
+    return _stream_of_values(columns, _feature_fields(width), itertools.chain(head, values))
 
 
 def _feature_fields(count: int) -> list[pa.Field]:
@@ -353,6 +361,7 @@ def _feature_fields(count: int) -> list[pa.Field]:
 
 
 def _sha256(path: str) -> str:
+    """Return the sha256 of a file. Raises `UsageError` if it cannot be read."""
     from tacpipe.io.hashing import file_digest
 
     try:

@@ -73,6 +73,7 @@ def _require_uncertainty(task: Task, request: PredictionRequest) -> None:
 
 
 def _predict_causally(task: Task, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+    """Return predictions as a live session would make them. Raises `UsageError` if models of the task do not run live."""
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
 

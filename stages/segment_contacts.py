@@ -65,7 +65,7 @@ class Params(StreamSelection):
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Raise an error for contacts that end above their start level, and for thresholds without effect."""
+        """Raise `UsageError` for contacts that end above their start level, and for thresholds without effect."""
         if self.thresholds == "noise" and (self.on_count, self.off_count) != (Params.on_count, Params.off_count):
             raise UsageError(
                 f"thresholds is noise, and on_count {self.on_count:g} and off_count {self.off_count:g} would do nothing; "
@@ -103,7 +103,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     limits: list[Thresholds] = []
     rest_metadata: dict[str, dict[str, str]] = {}
     schema = columns.schema
-    sensors = _sensors(recording.name, schema)
+    sensors = _tactile_columns(recording.name, schema)
     units = {stream: common_unit(schema, names) for stream, names in sensors.items()}
     fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
     _check_levels(params, recording.name, units, fixed)
@@ -135,7 +135,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
     largest = [float(np.nanmax(load, initial=0.0)) for load in stacked]
-    notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
+    notes = [] if len(intervals) else [_no_contact_note(params, units, limits, largest, fixed)]
 
     def mark(table: pa.Table, first: int) -> pa.Table:
         contact = to_arrow(numbers[first : first + table.num_rows])
@@ -145,7 +145,10 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:
-    """Raise an error for thresholds in a unit that no stream has, because they would have no effect."""
+    """Raise `UsageError` for thresholds in a unit that no stream has, because they would have no effect.
+
+    ``fixed`` are the streams with thresholds in counts.
+    """
     if params.on_level is not None and params.on_level <= 0:
         raise UsageError(f"on_level is {params.on_level:g}; it must be above 0, or every row would be in contact.")
     described = ", ".join(f"{stream or 'a sensor'} in {unit or 'no unit'}" for stream, unit in units.items())
@@ -172,16 +175,16 @@ def _fixed_thresholds(params: Params, thresholds: Thresholds) -> Thresholds:
 def _threshold_attributes(
     units: Mapping[str, str], limits: Sequence[Thresholds], fixed: Collection[str]
 ) -> dict[str, Attribute]:
-    """Return attributes with the thresholds of streams that are not in ``fixed``."""
-    described: dict[str, Attribute] = {}
+    """Return attributes with the thresholds of streams that are not in ``fixed``, and their unit."""
+    attributes: dict[str, Attribute] = {}
     for (stream, unit), (on, off) in zip(units.items(), limits, strict=True):
         if stream not in fixed and math.isfinite(on):
-            begins = f"{stream}_contact" if stream else "contact"
-            described |= {f"{begins}_on": on, f"{begins}_off": off, f"{begins}_unit": unit}
-    return described
+            prefix = f"{stream}_contact" if stream else "contact"
+            attributes |= {f"{prefix}_on": on, f"{prefix}_off": off, f"{prefix}_unit": unit}
+    return attributes
 
 
-def _no_contact(
+def _no_contact_note(
     params: Params,
     units: Mapping[str, str],
     limits: Sequence[Thresholds],
@@ -189,13 +192,14 @@ def _no_contact(
     fixed: Collection[str],
 ) -> str:
     """Return the note for a recording without contact: thresholds, maximum load, and what to do."""
-    descriptions = [
-        f"{stream or 'the sensor'} starts contact at a load of {_number(on)} {unit}".rstrip()
-        + f" and reaches {_number(largest_load)} {unit}".rstrip()
-        if math.isfinite(on)
-        else f"{stream or 'the sensor'} never leaves its level at rest"
-        for (stream, unit), (on, _), largest_load in zip(units.items(), limits, largest, strict=True)
-    ]
+    descriptions = []
+    for (stream, unit), (on, _), largest_load in zip(units.items(), limits, largest, strict=True):
+        subject = stream or "the sensor"
+        if math.isfinite(on):
+            threshold = f"{subject} starts contact at a load of {_number(on)} {unit}".rstrip()
+            descriptions.append(f"{threshold} and reaches {_number(largest_load)} {unit}".rstrip())
+        else:
+            descriptions.append(f"{subject} never leaves its level at rest")
     names = ["--on-count"] * bool(fixed) + ["--on-level"] * (set(fixed) != set(units))
     alternative = ", or give --thresholds noise" if fixed else ""
     return (
@@ -209,8 +213,8 @@ def _number(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def _sensors(name: str, schema: pa.Schema) -> dict[str, list[str]]:
-    """Return the tactile columns of each stream, grouped by taxel."""
+def _tactile_columns(name: str, schema: pa.Schema) -> dict[str, list[str]]:
+    """Return the tactile columns of each stream, grouped by taxel. Raises `TacpipeError` if there are none."""
     columns_by_stream: dict[str, list[str]] = {}
     for field in schema:
         metadata = field.metadata or {}

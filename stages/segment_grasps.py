@@ -105,7 +105,10 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the reading after both fingers closed, as one row, and the time when both first touched."""
+    """Return the reading after both fingers closed, as one row, and the time when both first touched, in ns.
+
+    Raises `TacpipeError` if columns or values are missing, or the fingers never press or settle.
+    """
     import numpy as np
 
     from tacpipe.channels import biotac_sp, schema

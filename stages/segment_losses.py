@@ -64,7 +64,9 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
         )
     tables = {stream: recording.table(stream) for stream in recording.streams}
     channels = {stream: tactile.columns(table.schema, "tactile") for stream, table in tables.items()}
-    touches = {stream: _touch(recording.name, tables[stream], names) for stream, names in channels.items() if names}
+    touches = {
+        stream: _read_touch(recording.name, tables[stream], names) for stream, names in channels.items() if names
+    }
     if not touches:
         raise TacpipeError(
             f"Recording {recording.name} has no tactile channel. Run `tacpipe extract difference` on videos of gels first."
@@ -102,8 +104,11 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
     )
 
 
-def _touch(name: str, table: pa.Table, channels: Sequence[str]) -> tuple[Times, Floats]:
-    """Return times and tactile channels (time, channel) of a stream, with NaN as 0."""
+def _read_touch(name: str, table: pa.Table, channels: Sequence[str]) -> tuple[Times, Floats]:
+    """Return times and tactile channels (time, channel) of a stream, with NaN as 0.
+
+    Raises `TacpipeError` below two rows.
+    """
     import numpy as np
 
     from tacpipe.codecs import tactile

@@ -91,7 +91,7 @@ class Params(StreamSelection):
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:
-        """Raise an error for an even median, for inconsistent pressure limits, and for a load without effect."""
+        """Raise `UsageError` for an even median, for inconsistent pressure limits, and for a load without effect."""
         if self.load_trigger is not None and self.trigger != "load":
             raise UsageError(
                 f"load_trigger is {self.load_trigger:g} and trigger is {self.trigger}; give --trigger load with it."
@@ -155,7 +155,10 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | Columns]) -> RecordingOutput:
-    """Return the slide of a sensor with any unit: the rows in contact in which the arm moves, if it was recorded."""
+    """Return the slide of a sensor with any unit: the rows in contact in which the arm moves, if it was recorded.
+
+    Raises `TacpipeError` if there is no tactile stream or no slide.
+    """
     import numpy as np
     import pyarrow as pa
 
@@ -177,9 +180,9 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
             yield values
 
     level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
-    loaded, repeated = load_in_blocks(blocks, level, count_axes(stream.schema, names))
+    loads, repeated = load_in_blocks(blocks, level, count_axes(stream.schema, names))
     if params.load_trigger is None:
-        limits = noise_thresholds(repeated, loaded, t_ns, params.rest_s, rows)
+        limits = noise_thresholds(repeated, loads, t_ns, params.rest_s, rows)
     else:
         limits = Thresholds(params.load_trigger, OFF_FRACTION * params.load_trigger)
     unit = common_unit(stream.schema, names)
@@ -187,7 +190,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     profile = arm.profile(streams, t_ns, by_place=True)
     release()
     try:
-        touched = slide_signals.loaded_rows(loaded, limits.on, limits.off, unit)
+        touched = slide_signals.loaded_rows(loads, limits.on, limits.off, unit)
         slide = touched
         if profile:
             usual_m_s = float(np.nanquantile(profile["speed_m_s"][slice(*touched)], USUAL_SPEED))
@@ -210,7 +213,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     whole = [channel for channel, is_measured in zip(names, measured, strict=True) if is_measured]
     table, spikes = remove_spikes(pa.concat_tables(pieces), params.spike_frames, params.spike_deviations, height, whole)
     attributes: dict[str, Attribute] = {
-        "load_mean": float(f"{loaded[kept_rows].mean():.4g}"),
+        "load_mean": float(f"{loads[kept_rows].mean():.4g}"),
         "load_trigger": float(f"{limits.on:.4g}"),
         "slide_frames": stop - first,
         "spikes": int(spikes[first - begin : stop - begin].sum()),

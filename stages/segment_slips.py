@@ -61,7 +61,7 @@ class Params(StreamSelection):
     saturated_count: Annotated[NonNegativeFloat, Unit("count")] = 544.0
 
     def check(self) -> None:
-        """Raise an error for slips that end above their start level."""
+        """Raise `UsageError` for slips that end above their start level."""
         if self.off_sigma > self.on_sigma:
             raise UsageError(
                 f"off_sigma is {self.off_sigma:g}, above on_sigma, {self.on_sigma:g}; a slip must end at or below the rate "
@@ -87,7 +87,7 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     if unit in METRES:
         readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
     elif unit not in (COUNT, ""):
-        raise _no_distance(recording.name, channel, unit, table)
+        raise _unit_error(recording.name, channel, unit, table)
     t_ns = table.column("t_ns").to_numpy()
     rate_hz = _rate_hz(recording.name, t_ns)
     contact = table.column("contact").to_numpy() if "contact" in table.column_names else np.zeros(len(t_ns))
@@ -125,7 +125,10 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
 
 
 def _proximity(name: str, channel: str, table: Columns) -> str:
-    """Return the column with the object's distance."""
+    """Return the column with the object's distance: ``channel``, or the only one.
+
+    Raises `TacpipeError` if there is none.
+    """
     proximity_columns = columns_with_quantity(table, "proximity")
     if channel:
         if channel not in table.column_names:
@@ -143,7 +146,7 @@ def _proximity(name: str, channel: str, table: Columns) -> str:
     return proximity_columns[0]
 
 
-def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeError:
+def _unit_error(name: str, channel: str, unit: str, table: Columns) -> TacpipeError:
     """Return the error for a proximity in a unit other than counts or a length."""
     stream = (table.schema.field(channel).metadata or {}).get(b"stream", b"").decode()
     return TacpipeError(

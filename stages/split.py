@@ -38,7 +38,7 @@ class Split:
     few_of: str = ""  # attribute=value of the recordings that few limits, such as sensor=roboskin; empty: all
 
     def check(self) -> None:
-        """Raise an error for options that need few, and for an attribute without a value."""
+        """Raise `UsageError` for options that need few, and for an attribute without a value."""
         if not self.few and (self.few_by or self.few_of):
             option = "few_by" if self.few_by else "few_of"
             raise UsageError(
@@ -55,7 +55,7 @@ class Tested(Split):
     test: Annotated[float, Range(0, below=1)] = 0.15  # fraction of the recordings for testing
 
     def check(self) -> None:
-        """Raise an error for fractions that leave no training recordings."""
+        """Raise `UsageError` for fractions that leave no training recordings."""
         super().check()
         if self.val + self.calibration + self.test >= 1:
             raise UsageError(
@@ -137,16 +137,24 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
             "role": pa.array(list(roles.values()), pa.string()),
         }
     )
-    notes = [_note(bare, len({fold for _, fold in roles}), len(attributes), params.val, enough)] if bare else []
+    notes = [_note_on_val(bare, len({fold for _, fold in roles}), len(attributes), params.val, enough)] if bare else []
     return Result(recordings={"split": RecordingOutput(table)}, notes=notes)
 
 
-def _note(bare: Sequence[int], folds: int, recordings: int, val: float, enough: float | None) -> str:
-    """Return a note on folds without validation recordings; ``enough`` is a fraction with which all folds have some."""
-    fold_numbers = ", ".join(map(str, bare[:SHOWN])) + (f" and {len(bare) - SHOWN} more" if len(bare) > SHOWN else "")
-    subject = f"Folds {fold_numbers} of {folds} have" if len(bare) > 1 else f"Fold {fold_numbers} of {folds} has"
-    advice = f"Give --val {enough:g}" if enough else "Add recordings"
+def _note_on_val(
+    folds_without_val: Sequence[int], fold_count: int, recording_count: int, val: float, sufficient_val: float | None
+) -> str:
+    """Return a note on folds without validation recordings; ``sufficient_val``: fraction that suffices, if known."""
+    fold_numbers = ", ".join(map(str, folds_without_val[:SHOWN])) + (
+        f" and {len(folds_without_val) - SHOWN} more" if len(folds_without_val) > SHOWN else ""
+    )
+    subject = (
+        f"Folds {fold_numbers} of {fold_count} have"
+        if len(folds_without_val) > 1
+        else f"Fold {fold_numbers} of {fold_count} has"
+    )
+    advice = f"Give --val {sufficient_val:g}" if sufficient_val else "Add recordings"
     return (
-        f"{subject} no validation recording: val {val:g} of {recordings} recordings gives none. {advice}, or --val 0 if "
-        f"none is needed; networks are stopped or chosen by validation recordings."
+        f"{subject} no validation recording: val {val:g} of {recording_count} recordings gives none. {advice}, or --val 0 "
+        f"if none is needed; networks are stopped or chosen by validation recordings."
     )

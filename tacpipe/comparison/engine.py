@@ -82,12 +82,12 @@ class Comparison:
 
     @property
     def best(self) -> ComparisonRow | None:
-        """The best method."""
+        """The best method; None without a method."""
         return next(iter(self.models), None)
 
     @property
     def best_baseline(self) -> ComparisonRow | None:
-        """The baseline that the best method is compared with."""
+        """The baseline that the best method is compared with; None without a baseline."""
         name = self.best.baseline if self.best else ""
         baselines = self.of("baseline")
         return next((row for row in baselines if row.name == name), next(iter(baselines), None))

@@ -89,7 +89,7 @@ class Tensors:
 
 def arrays_of_table(table: pa.Table) -> Arrays:
     """Return the columns of ``table`` as arrays, in order."""
-    by_column = {field.name: _array(column) for field, column in zip(table.schema, table.columns, strict=True)}
+    by_column = {field.name: _to_array(column) for field, column in zip(table.schema, table.columns, strict=True)}
     return Arrays(by_column, tuple(field.name for field in table.schema if is_channel(field)))
 
 
@@ -120,7 +120,7 @@ def is_channel(field: pa.Field) -> bool:
     return (field.metadata or {}).get(b"quantity", b"").decode() not in NOT_CHANNELS
 
 
-def _array(column: pa.ChunkedArray) -> AnyArray:
+def _to_array(column: pa.ChunkedArray) -> AnyArray:
     """Return a column in its own type (time,); pyarrow would convert integers with nulls to floats."""
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -190,10 +190,11 @@ def labelled_frame(
     labelled_tables = {}
     kinds = {name: _kind([dataset[recording].attributes.get(name) for recording in tables]) for name in chosen}
     for recording, table in tables.items():
+        labelled_table = table
         for name in chosen:
             value = pa.scalar(_as(dataset[recording].attributes.get(name), kinds[name]), kinds[name])
-            table = table.append_column(name, pa.repeat(value, table.num_rows))
-        labelled_tables[recording] = table
+            labelled_table = labelled_table.append_column(name, pa.repeat(value, table.num_rows))
+        labelled_tables[recording] = labelled_table
     return labelled_tables
 
 

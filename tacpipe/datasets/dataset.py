@@ -41,6 +41,10 @@ class Recording:
     """One recording of a dataset: its attributes, and its tables, which are read on demand."""
 
     def __init__(self, name: str, entry: RecordingEntry, read: Reader, dataset: Dataset | None = None) -> None:
+        """Open a recording of a manifest; ``read`` returns the verified content of its shards.
+
+        ``dataset`` is the dataset that it belongs to, None for the input of a stage.
+        """
         self.name = name
         self.attributes: Mapping[str, Attribute] = MappingProxyType(dict(entry["attributes"]))
         self._entry = entry
@@ -106,7 +110,8 @@ class Recording:
 
         A synchronized recording is one table with the columns of all streams. There, ``stream`` selects ``t_ns`` and
         the columns of that stream under their recorded names, without masks and ground truth. Without ``stream`` the
-        table is returned as stored. Raises `UsageError` if the stream does not exist.
+        table is returned as stored. ``columns`` are the columns to read, None for all. Raises `UsageError` if the
+        stream does not exist, and `DamagedError` if it is damaged.
         """
         from tacpipe.io.parquet import from_parquet
 
@@ -137,7 +142,10 @@ class Recording:
         return columns
 
     def _content(self, stream: str) -> bytes | Path:
-        """Return the verified bytes of a stream, or the path of a large one in the store, which need not fit in memory."""
+        """Return the verified bytes of a stream, or the path of a large one in the store, which need not fit in memory.
+
+        Raises `UsageError` if the stream does not exist.
+        """
         if stream not in self._shards:
             raise self._missing_stream_error(stream, [])
         name, path = self._shards[stream]["digest"], shard_path(self.name, stream)
@@ -146,6 +154,7 @@ class Recording:
         return file or self._read(name, path)
 
     def _missing_stream_error(self, stream: str, columns_of_streams: Sequence[str]) -> UsageError:
+        """Return the error for a missing stream; ``columns_of_streams`` are the streams in a synchronized table."""
         if self.streams == ("",) and not columns_of_streams:
             return UsageError(f"Recording {self.name} has no stream {stream!r}; it is one table.")
         existing = ", ".join(map(repr, columns_of_streams or self.streams))
@@ -190,6 +199,11 @@ class Dataset:
         directory: Path | None = None,
         opener: Callable[[Path | str], Dataset] | None = None,
     ) -> None:
+        """Open the dataset of a manifest; ``read`` returns verified content, and ``names`` are its recordings, None for all.
+
+        ``directory`` is where it is, and ``opener`` opens other datasets by path; both are None for the input of a
+        stage.
+        """
         self.source = manifest
         self.path = directory  # its directory, or None for the input of a stage
         self.recordings: Mapping[str, Recording] = _Recordings(self, manifest.included, read, names)
@@ -275,6 +289,7 @@ class Dataset:
         return self.only(selection.select_names(self, names, roles, role, {**(labels or {}), **conditions}))
 
     def _open(self, path: Path | str) -> Dataset:
+        """Return the opened dataset at a path. Raises `UsageError` in a stage, whose datasets are given."""
         if self._opener is None:
             raise UsageError(
                 f"Open {path} with tacpipe.open first, and give that: this dataset is one that a stage reads."
@@ -417,11 +432,11 @@ class Dataset:
 
         name = self._only_stream() if stream is None else stream
         order = columns and [*dict.fromkeys(columns)]
-        return {
-            recording.name: arrays.arrays_of_table(table if order is None else table.select(order))
-            for recording in self
-            for table in [recording.table(name, order)]
-        }
+        arrays_by_name = {}
+        for recording in self:
+            table = recording.table(name, order)
+            arrays_by_name[recording.name] = arrays.arrays_of_table(table if order is None else table.select(order))
+        return arrays_by_name
 
     def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Tensors]:
         """Return the tensors of each recording by name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).

@@ -18,7 +18,8 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
     """Upload the dataset that ``directory`` (or one file) is about to show, if the store has a bucket.
 
     If the bucket cannot be reached, recordings, which cannot be recomputed, are kept locally and a note reports that;
-    for computed datasets `StorageError` is raised. Call this before setting the root of the directory.
+    for computed datasets `StorageError` is raised. ``lasting`` is whether the replaced dataset must be kept in the
+    bucket. Call this before setting the root of the directory.
     """
     if not store.distant:
         return

@@ -49,12 +49,12 @@ class DirectoryChange:
 
 def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool = False) -> None:
     """Make ``directory`` show ``manifest``, as `change` does; if it already does, only set its root again."""
-    directory = directory.absolute()
-    if shows(store, manifest, directory):
-        deliver(store, directory, manifest)
-        store.roots.set(directory, manifest.content_digest)
+    absolute = directory.absolute()
+    if shows(store, manifest, absolute):
+        deliver(store, absolute, manifest)
+        store.roots.set(absolute, manifest.content_digest)
         return
-    change(store, directory, lambda: DirectoryChange(manifest, replace=replace))
+    change(store, absolute, lambda: DirectoryChange(manifest, replace=replace))
 
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
@@ -68,15 +68,15 @@ def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "f
     ``links``: all files are directly in the directory, as links to objects of the store. ``files``: some are copies or
     in folders.
     """
-    if not _current(directory, manifest):
+    if not _is_current(directory, manifest):
         return ""
-    linked = True
+    all_linked = True
     for path, name in manifest.objects():
         match = _matches(f"{directory}/{path}", store, name)
         if not match:
             return ""
-        linked = linked and match == "links" and "/" not in path
-    return "links" if linked else "files"
+        all_linked = all_linked and match == "links" and "/" not in path
+    return "links" if all_linked else "files"
 
 
 def change(store: Store, directory: Path, decide: Callable[[], DirectoryChange]) -> Manifest:
@@ -106,9 +106,10 @@ def changing(store: Store, directory: Path) -> Iterator[None]:
 
 
 def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
+    """Make ``directory`` show what is planned, with its lock held. Raises the errors of `change`."""
     manifest, relabelled = planned.manifest, planned.relabelled
     check_output(store, directory)
-    current = _current(directory, manifest)
+    current = _is_current(directory, manifest)
     stale: dict[str, str] = {}
     removed: set[str] = set()
     if current or (
@@ -128,9 +129,9 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     if manifest.exported or planned.replace:  # nothing else replaces an export
         edited = _edited_files(store, manifest, directory, {*stale, *removed})
     if edited and not planned.replace:
-        raise replacing.edited(directory, edited)
+        raise replacing.edited_files_error(directory, edited)
     with writing(directory):
-        before = None if current else replacing.outgoing(store, directory)
+        before = None if current else replacing.keep_replaced(store, directory)
         lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
         if edited:
             _store_edited_export(store, manifest, directory, edited)
@@ -138,8 +139,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
         if before is not None and lasting:
             _adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        root = store.roots.get(directory) if relabelled else None
-        key = planned.key if not relabelled else "" if root is None else root.get("key", "")
+        key = _stored_key(store, directory) if relabelled else planned.key
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
         sweep(directory, shards=any("/" in path for path in stale), deep=manifest.exported)
@@ -151,6 +151,12 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
         if manifest.recorded:
             _settle(store, directory, stale)
+
+
+def _stored_key(store: Store, directory: Path) -> str:
+    """Return the key in the root of a directory, empty without one."""
+    root = store.roots.get(directory)
+    return "" if root is None else root.get("key", "")
 
 
 def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
@@ -240,7 +246,7 @@ def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert file system errors about an output to a sentence. Raises them as `TacpipeError`."""
+    """Raise file system errors of the block as a `TacpipeError` about the output at ``path``."""
     try:
         yield
     except OSError as error:
@@ -281,7 +287,7 @@ def _compare_files(
 
 
 def _compare_pages(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
-    """Return the result of `_compare_files` for the pages of a manifest only."""
+    """Return path and digest of the pages to place, and the paths of those to remove, as `_compare_files` does."""
     before, now = (
         {} if side is None or side.pages is None else {page.path: page for page in side.pages.pages}
         for side in (current, manifest)
@@ -295,7 +301,7 @@ def _has_same_digest(before: Content | None, now: Content) -> bool:
 
 
 def refuse_links(directory: Path, paths: Iterable[str]) -> None:
-    """Raise an error for folders in a dataset that are links, because files behind them may not belong to the dataset."""
+    """Raise `UsageError` for folders in a dataset that are links: files behind them may not belong to the dataset."""
     for folder in {folder for path in paths for folder in list(Path(path).parents)[:-1]}:
         if (directory / folder).is_symlink():
             raise UsageError(
@@ -304,6 +310,7 @@ def refuse_links(directory: Path, paths: Iterable[str]) -> None:
 
 
 def _remove(directory: Path, paths: set[str]) -> None:
+    """Remove files of a dataset that exist, and the folders that are then empty."""
     for path in paths:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
@@ -314,7 +321,7 @@ def _remove(directory: Path, paths: set[str]) -> None:
 
 
 def check_output(store: Store, directory: Path) -> None:
-    """Raise an error if the directory contains something that tacpipe did not write."""
+    """Raise `UsageError` if the directory contains something that tacpipe did not write, or belongs to another dataset."""
     directory = directory.absolute()
     layout.refuse_within(directory)
     if directory.is_file():
@@ -361,6 +368,7 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
 
 
 def _link(source: str, target: Path) -> bool:
+    """Create ``target`` as a reflink or hard link of ``source``; return whether the file system supports that."""
     import fcntl
 
     with regular.opened(source, follow=False) as reading, open(target, "wb") as writing, contextlib.suppress(OSError):
@@ -388,7 +396,8 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
     return "files" if status.st_size == stored.st_size and file_digest(path) == name else ""
 
 
-def _current(directory: Path, manifest: Manifest) -> bool:
+def _is_current(directory: Path, manifest: Manifest) -> bool:
+    """Return whether the manifest in a directory has the content of ``manifest``. Raises `IrregularError` for no file."""
     try:
         file = directory / NAME
         status = file.stat()

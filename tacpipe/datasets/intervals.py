@@ -56,11 +56,11 @@ def from_text(text: str) -> list[Interval]:
         match = re.fullmatch(f"{NUMBER}-{NUMBER}", word)
         if match is None:
             raise UsageError(f"{plain(word)} is not an interval. Give seconds as FROM-TO, as in 1.2-1.5.")
-        intervals.append(checked(float(match[1]), float(match[2])))
+        intervals.append(checked_interval(float(match[1]), float(match[2])))
     return intervals
 
 
-def checked(begin: float, end: float) -> Interval:
+def checked_interval(begin: float, end: float) -> Interval:
     """Return an interval. Raises `UsageError` if it is negative, infinite or ends before it begins."""
     if not (0 <= begin <= end < math.inf):
         raise UsageError(

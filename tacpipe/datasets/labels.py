@@ -80,25 +80,24 @@ def change(
     if interval is None:
         return _change(path, lambda dataset: dict.fromkeys(_matching(dataset, patterns), labels))
     kind, begin, end = interval
-    name, added = intervals.attribute(kind), intervals.checked(begin, end)
+    name, added = intervals.attribute(kind), intervals.checked_interval(begin, end)
 
     def labels_for(dataset: Found) -> ByRecording:
-        recordings = dataset.manifest.recordings
-        return {
-            recording: {
-                **labels,
-                name: intervals.to_text(
-                    [*(intervals.intervals_of(recordings[recording]["attributes"], kind) or []), added]
-                ),
-            }
-            for recording in _matching(dataset, patterns)
-        }
+        new_labels = {}
+        for recording in _matching(dataset, patterns):
+            attributes = dataset.manifest.recordings[recording]["attributes"]
+            existing = intervals.intervals_of(attributes, kind) or []
+            new_labels[recording] = {**labels, name: intervals.to_text([*existing, added])}
+        return new_labels
 
     return _change(path, labels_for)
 
 
 def require_recordings(labels_by_name: ByRecording, existing: ByRecording, path: Path) -> ByRecording:
-    """Return the labels of a file. Raises `UsageError` if it names recordings that do not exist."""
+    """Return ``labels_by_name``, those of the file ``path``.
+
+    Raises `UsageError` if it names recordings that do not exist.
+    """
     unknown = sorted(set(labels_by_name) - set(existing))
     if unknown:
         raise UsageError(
@@ -150,6 +149,7 @@ def _differ(value: Attribute, current: Attribute) -> bool:
 
 
 def _change(path: Path, new_labels: Callable[[Found], ByRecording]) -> Changed:
+    """Set the labels that ``new_labels`` returns for the current dataset. Raises `UsageError` as `_refuse_made` does."""
     dataset = manifest_of.find(path)
     store, directory = locate(dataset.directory), dataset.directory
     _refuse_made(dataset.manifest, directory)
@@ -168,6 +168,7 @@ def _change(path: Path, new_labels: Callable[[Found], ByRecording]) -> Changed:
 
 
 def _refuse_made(manifest: Manifest, directory: Path) -> None:
+    """Raise `UsageError` for a dataset that was made from others, because the next run would undo its labels."""
     if manifest.inputs:
         raise UsageError(
             f"{directory} was made by {manifest.stage} from other datasets, and the next run would undo its labels. "
@@ -176,6 +177,7 @@ def _refuse_made(manifest: Manifest, directory: Path) -> None:
 
 
 def _matching(dataset: Found, patterns: Sequence[str]) -> list[str]:
+    """Return the names of the recordings that match a pattern, sorted. Raises `UsageError` if a pattern matches none."""
     recordings = dataset.manifest.recordings
     names: set[str] = set()
     for pattern in patterns:

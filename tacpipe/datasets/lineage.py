@@ -79,14 +79,18 @@ def trace(path: Path) -> LineageNode:
     return {**tree, "provenance": provenance, "changes": changed}
 
 
-def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> LineageNode:
+def _node(store: Store, manifest: Manifest, name: str, paths: dict[str, str]) -> LineageNode:
+    """Return the node of a manifest in the lineage, with its inputs; ``places`` are the paths of manifests by digest.
+
+    Inputs that cannot be read are marked as lost. Raises `StorageError` if the system fails to read one.
+    """
     inputs: dict[str, list[LineageNode | LostNode]] = {}
     for argument, datasets in manifest.inputs.items():
         inputs[argument] = []
         for dataset in datasets:
             try:
                 source = manifest_of.stored(store, dataset["manifest"])
-                inputs[argument].append(_node(store, source, dataset["manifest"], places))
+                inputs[argument].append(_node(store, source, dataset["manifest"], paths))
             except StorageError:
                 raise
             except TacpipeError as error:
@@ -99,7 +103,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
         "params": params_of.with_current_names(manifest.stage, manifest.params),
         "digest": manifest.digest,
         "manifest": name,
-        "path": places.get(name),
+        "path": paths.get(name),
         "recordings": len(manifest.recordings),
         "rows": manifest.rows,
         "files": {file: value["digest"] for file, value in manifest.files.items()},
@@ -168,6 +172,7 @@ def _has_equal_content(before: Manifest, now: Manifest) -> bool:
 def _input_changes(
     store: Store, argument: str, before: Sequence[InputDataset], now: Sequence[InputDataset]
 ) -> list[str]:
+    """Return lines on how the inputs of an argument differ: recordings and files. Raises `StorageError`."""
     if [dataset["dataset"] for dataset in before] == [dataset["dataset"] for dataset in now]:
         return []
     try:
@@ -196,23 +201,24 @@ def _compare_recordings(
     subject: str, before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> list[str]:
     """Describe which recordings of two datasets differ; recordings in shared pages are equal."""
-    new: list[str] = []
+    new_names: list[str] = []
     removed: list[str] = []
-    shards: list[str] = []
-    attributes: list[str] = []
-    for name, old, entry in pages.compared(*pages.differing(before, now)):
-        if old is None or entry is None:
-            (new if old is None else removed).append(name)
+    changed_shards: list[str] = []
+    changed_attributes: list[str] = []
+    for name, old_entry, new_entry in pages.compared(*pages.differing(before, now)):
+        if old_entry is None or new_entry is None:
+            (new_names if old_entry is None else removed).append(name)
             continue
-        shards += [name] if old["shards"] != entry["shards"] else []
-        attributes += [name] if old["attributes"] != entry["attributes"] else []
+        changed_shards += [name] if old_entry["shards"] != new_entry["shards"] else []
+        changed_attributes += [name] if old_entry["attributes"] != new_entry["attributes"] else []
     return [
-        *_count_groups(f"{subject}.shards", {"new": new, "gone": removed, "other": shards}),
-        *_count_groups(f"{subject}.attributes", {"other": attributes}),
+        *_count_groups(f"{subject}.shards", {"new": new_names, "gone": removed, "other": changed_shards}),
+        *_count_groups(f"{subject}.attributes", {"other": changed_attributes}),
     ]
 
 
 def _compare_groups(subject: str, before: Mapping[str, V], now: Mapping[str, V]) -> list[str]:
+    """Return lines with the names whose values are new, gone or different."""
     groups = {
         "new": sorted(set(now) - set(before)),
         "gone": sorted(set(before) - set(now)),
@@ -242,12 +248,13 @@ def to_text(tree: LineageNode) -> str:
 
 def _nested_params(value: Any) -> StoredParams | None:
     """Return a param with parts, such as a layout, which is stored as JSON, or None for a plain value."""
+    nested = value
     if isinstance(value, str) and value.startswith("{"):
         try:
-            value = json.loads(value)
+            nested = json.loads(value)
         except ValueError:
             return None
-    return value if isinstance(value, Mapping) else None
+    return nested if isinstance(nested, Mapping) else None
 
 
 def _rows(value: Any) -> list[StoredParams]:

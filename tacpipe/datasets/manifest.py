@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -84,11 +85,8 @@ class Manifest:
             pages = recordings.pages
             if _same_pages(labels, pages, "labelled") and _same_pages(sources, pages, "sourced"):
                 return pages
-        return Pages.from_items(
-            (name, Item(entry, labels.get(name), sources.get(name)))
-            for part in pages_of.parts(recordings)
-            for name, entry in sorted(part.items())
-        )
+        entries = itertools.chain.from_iterable(sorted(part.items()) for part in pages_of.parts(recordings))
+        return Pages.from_items((name, Item(entry, labels.get(name), sources.get(name))) for name, entry in entries)
 
     @cached_property
     def digest(self) -> str:
@@ -250,7 +248,7 @@ class Manifest:
                 return {"digest": page.digest, "bytes": page.bytes}
         bare = path.removesuffix(".parquet")
         parts = bare.split("/")
-        places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
+        places = [(bare, ""), *(("/".join(parts[:depth]), "/".join(parts[depth:])) for depth in range(1, len(parts)))]
         candidates = (candidate for candidate in places if bare != path and candidate[0] in self.recordings)
         shards = (self.recordings[name]["shards"].get(stream) for name, stream in candidates)
         return next((shard for shard in shards if shard is not None), None)
@@ -295,7 +293,7 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
     Raises `DamagedError` if the bytes are not a manifest or its content does not match its digest.
     """
     name = bytes_digest(content)
-    place = name, "" if read is None else read.place
+    place = name, ("" if read is None else read.place)
     if place in _parsed:  # a command parses the same manifest several times
         return _parsed[place]
     regular.expect_parsed(source, len(content))
@@ -327,7 +325,10 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
 
 
 def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[Manifest, str]:
-    """Return the manifest in a JSON value, and its declared digest."""
+    """Return the manifest in a JSON value, and its declared digest.
+
+    Raises ``ValueError`` or ``KeyError`` for an invalid value, and `UsageError` for a newer format.
+    """
     format_version, declared = value.pop("format"), value.pop("digest")
     if type(format_version) is not int or format_version < FORMAT:
         raise ValueError(f"its format is {excerpt(format_version)}")
@@ -355,7 +356,10 @@ def stored(store: ObjectReader, name: str, source: str = "") -> Manifest:
 
 
 def stored_or_none(store: ObjectReader, name: str) -> Manifest | None:
-    """Return the manifest with this digest, or None if it is missing or damaged. Raises `StorageError`."""
+    """Return the manifest with this digest, or None if it is missing or damaged.
+
+    Raises `StorageError` if the system fails to read it.
+    """
     try:
         return stored(store, name)
     except StorageError:
@@ -435,6 +439,7 @@ def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
 
 
 def _check_lineage(manifest: Manifest) -> None:
+    """Raise ``ValueError``, ``TypeError`` or ``KeyError`` if inputs, steps, labels or sources of a manifest are invalid."""
     for sources in manifest.inputs.values():
         for source in sources:
             _expect_digest(source["manifest"])

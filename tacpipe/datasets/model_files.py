@@ -48,7 +48,7 @@ Kind = type | tuple[type, ...]
 
 @contextlib.contextmanager
 def validated(noun: str) -> Iterator[None]:
-    """Raise errors about files that were created or edited by hand as one sentence about ``noun``."""
+    """Raise errors of the block about files that were created or edited by hand as a `TacpipeError` about ``noun``."""
     try:
         yield
     except TacpipeError:
@@ -62,7 +62,10 @@ def validated(noun: str) -> Iterator[None]:
 
 
 def task(files: Mapping[str, bytes], place: str = "This") -> Task:
-    """Return the task of the model among ``files``. Raises `TacpipeError` if there is none."""
+    """Return the task of the model among ``files``.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it is invalid.
+    """
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
@@ -121,7 +124,7 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, An
     return arrays_by_name
 
 
-def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
+def build_with_weights(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
     """Return the network of ``build`` with these ``weights``. Memory is allocated only if they fit.
 
     Raises `TacpipeError` if a tensor is missing, unexpected, or of another shape.
@@ -139,14 +142,15 @@ def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Ten
                 f"The model's weights do not fit its {CONFIG}: {plain(name)} is {shapes.get(name, 'missing')} and should "
                 f"be {expected.get(name, 'missing')}. Copy its files again from their source."
             )
-    kinds = {name: value.dtype for name, value in network.state_dict().items()}
+    dtypes = {name: value.dtype for name, value in network.state_dict().items()}
     # `to_empty` imports sympy, which takes as long as a small network's evaluation
-    network.load_state_dict({name: value.to(kinds[name], copy=True) for name, value in weights.items()}, assign=True)
+    network.load_state_dict({name: value.to(dtypes[name], copy=True) for name, value in weights.items()}, assign=True)
     return network
 
 
 @contextlib.contextmanager
 def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
+    """Raise errors of the block, or of the type ``kind``, as a `TacpipeError` about the safetensors file ``name``."""
     try:
         yield
     except (kind, ValueError, TypeError, LookupError, OverflowError, AttributeError, RuntimeError) as error:
@@ -157,6 +161,7 @@ def _readable(name: str, kind: type[Exception]) -> Iterator[None]:
 
 
 def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
+    """Raise `TacpipeError` if the tensors of a file are not all ``finite``."""
     wrong = next((key for key, fine in finite.items() if not fine), None)
     if wrong is not None:
         raise TacpipeError(
@@ -172,6 +177,7 @@ def _value_at(value: Any, path: str) -> Any:
 
 
 def _require(name: str, path: str, value: Any, kind: Kind) -> None:
+    """Raise `TacpipeError` unless a value of a file is of an allowed type, and an integer from 0 to `MAX_SIZE`."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     right = any(_is(value, allowed) for allowed in kinds)
     if not right:

@@ -62,8 +62,8 @@ def stored_columns(schema: pa.Schema) -> dict[str, dict[str, str]]:
     columns: dict[str, dict[str, str]] = {}
     for field in schema:
         metadata = field.metadata or {}
-        signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
-        if signal:
+        is_signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
+        if is_signal:
             stream = metadata.get(b"stream", b"").decode()
             columns.setdefault(stream, {"t_ns": "t_ns"})[_recorded_name(field.name, stream)] = field.name
     return columns
@@ -79,7 +79,10 @@ _VALUES = 5  # a label with more values is only counted
 
 
 def lines(dataset: Dataset) -> list[tuple[str, str]]:
-    """Return (title, text) of each line. Streams and rates are those of the first recording, the only one that is read."""
+    """Return title and text of each line.
+
+    Streams and rates are those of the first recording, the only one that is read.
+    """
     manifest = dataset.source
     params = listed([f"{name}={value}" for name, value in manifest.params.items()], _PARAMS)
     rows = [("made by", f"{manifest.stage} version {manifest.version}{f' ({params})' if params else ''}")]
@@ -120,9 +123,8 @@ def recording_html(recording: Recording) -> str:
     labels = escape(printable.lines([listed(labels_shown, _LABELS)])) if labels_shown else ""
     title = f"<b>{escape(printable.shown(recording.name))}</b> {labels}"
     try:
-        tables = (
-            {} if recording.streams == ("",) and "t_ns" not in recording.table().column_names else streams_of(recording)
-        )
+        has_times = recording.streams != ("",) or "t_ns" in recording.table().column_names
+        tables = streams_of(recording) if has_times else {}
         picture = drawing.svg(
             drawing.picture_rows(curves.curves_of_streams(tables), taxels.taxels_from_streams(tables))
         )
@@ -138,6 +140,7 @@ def _title(dataset: Dataset) -> str:
 
 
 def _streams(recording: Recording) -> str:
+    """Return the streams of a recording with their sizes as text, or why they cannot be read."""
     try:
         if recording.streams == ("",):
             table = recording.table()

@@ -240,6 +240,10 @@ class Pages:
     """
 
     def __init__(self, pages: Iterable[Page], read: PageReader | None, fresh: Mapping[str, bytes]) -> None:
+        """Build the pages of a root: ``read`` reads their objects, of which ``fresh`` are not stored yet, by digest.
+
+        Raises ``ValueError`` if they are not in order.
+        """
         self.pages = tuple(pages)
         self._firsts = [page.first for page in self.pages]
         if any(a >= b for a, b in zip(self._firsts, self._firsts[1:], strict=False)):
@@ -362,6 +366,7 @@ class Pages:
         return content
 
     def _check(self, content: PageContent, stored: bytes, number: int) -> None:
+        """Raise ``ValueError``, ``TypeError`` or ``KeyError`` if a page does not match its entry in the root."""
         page = self.pages[number]
         content.check()
         if content.describe(stored, name=page.digest) != page:
@@ -536,7 +541,7 @@ def differing(before: Mapping[str, V], now: Mapping[str, V]) -> tuple[Mapping[st
 def compared(
     before: Mapping[str, RecordingEntry], now: Mapping[str, RecordingEntry]
 ) -> Iterator[tuple[str, RecordingEntry | None, RecordingEntry | None]]:
-    """Yield name, old entry and new entry of all recordings of two datasets, sorted by name."""
+    """Yield name, old entry and new entry (or None) of all recordings of two datasets, sorted by name."""
     before_items, now_items = (iter(_sorted_entries(recordings)) for recordings in (before, now))
     old, new = next(before_items, None), next(now_items, None)
     while old is not None or new is not None:
@@ -607,9 +612,9 @@ def _refuse_attributes(attributes: Mapping[str, Attribute]) -> None:
 
 def check_contents(contents: Iterable[Content]) -> None:
     """Raise `ValueError`, `TypeError` or `KeyError` if shards or files lack a digest or a size in bytes."""
-    contents = list(contents)
-    check_counts([content["bytes"] for content in contents])
-    for name in (content["digest"] for content in contents):
+    all_contents = list(contents)
+    check_counts([content["bytes"] for content in all_contents])
+    for name in (content["digest"] for content in all_contents):
         if type(name) is not str or not DIGEST.fullmatch(name):
             raise ValueError(f"{str(name)[:80]!r} is not a digest")
 

@@ -230,7 +230,7 @@ def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> Non
         )
 
 
-def edited(output: Path, paths: Sequence[str]) -> UsageError:
+def edited_files_error(output: Path, paths: Sequence[str]) -> UsageError:
     """Return the error for edited files of an export."""
     plural = len(paths) > 1
     return UsageError(
@@ -240,7 +240,7 @@ def edited(output: Path, paths: Sequence[str]) -> UsageError:
     )
 
 
-def appended(before: Manifest, ingested: Manifest) -> Manifest:
+def append_manifest(before: Manifest, ingested: Manifest) -> Manifest:
     """Return the recordings of ``before`` and ``ingested``, which takes precedence.
 
     Recordings that could not be read this time are kept unchanged.
@@ -288,10 +288,10 @@ def returning_labels(
     return labels
 
 
-def outgoing(store: Store, directory: Path) -> Manifest | None:
+def keep_replaced(store: Store, directory: Path) -> Manifest | None:
     """Store and return the manifest that a publication at ``directory`` replaces, or return None if there is none.
 
-    It is also stored if it comes from git or from a copy, so that it can be checked out later.
+    It is also stored if it comes from git or from a copy, so that it can be checked out later. Raises `StorageError`.
     """
     try:
         dataset = manifest_of.find(directory)

@@ -51,9 +51,9 @@ _SHOWN, _LABELS = 5, 12  # number of names or values, and of labels, in an error
 
 
 def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, str] | None:
-    """Return the role by recording in ``fold`` of an opened split, or None without a split.
+    """Return the role by recording in ``fold`` of an opened split, only recordings with a role; None without a split.
 
-    Raises `UsageError` if it is not a split or has no such fold, and for a role or a fold without a split.
+    Raises `UsageError` if it is not a split or has no such fold, and for a ``role`` or a fold without a split.
     """
     if split is None:
         if role is not None or fold:
@@ -107,10 +107,14 @@ def unknown_label(dataset: Dataset, label: str) -> UsageError:
 
 
 def _select_by_label(dataset: Dataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
+    """Return the names whose label meets the condition.
+
+    Raises `UsageError` if no recording has the label, or none meets it.
+    """
     values = {name: dataset[name].attributes[label] for name in names if label in dataset[name].attributes}
     if not values:
         raise unknown_label(dataset, label)
-    meets = _test(condition)
+    meets = _predicate(condition)
     matching = [name for name, value in values.items() if meets(value)]
     if not matching:
         existing = listed(sorted({str(value) for value in values.values()}), _SHOWN)
@@ -119,7 +123,8 @@ def _select_by_label(dataset: Dataset, names: Sequence[str], label: str, conditi
     return matching
 
 
-def _test(condition: Wanted) -> Callable[[Attribute], Any]:
+def _predicate(condition: Wanted) -> Callable[[Attribute], Any]:
+    """Return the condition as a function of a label's value: equal, one of several, or the function itself."""
     if callable(condition):
         return condition
     is_collection = isinstance(condition, Collection) and not isinstance(condition, str)

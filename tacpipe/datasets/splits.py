@@ -84,9 +84,9 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     elif scheme.name == "blocked":
         folds = [_assign_blocks(fresh, attributes, scheme)]
     elif scheme.name == "authors":
-        folds = _authors(fresh, attributes, scheme)
+        folds = _assign_author_roles(fresh, attributes, scheme)
     elif scheme.name == "kfold":
-        folds = _kfold(fresh, attributes, scheme, keep)
+        folds = _assign_folds(fresh, attributes, scheme, keep)
     else:
         folds = _leave_one_out(attributes, scheme, keep)
     roles = {(name, fold): role for fold, roles_by_name in enumerate(folds) for name, role in roles_by_name.items()}
@@ -129,6 +129,7 @@ def sufficient_val(
 
 
 def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
+    """Raise `TacpipeError` for an unknown scheme, no recordings, or fractions and folds that leave none to train on."""
     if scheme.name not in SCHEMES:
         raise TacpipeError(f"There is no split scheme {scheme.name}; there are {', '.join(SCHEMES)}.")
     if not attributes:
@@ -147,6 +148,7 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
 
 
 def _check_options(scheme: Scheme) -> None:
+    """Raise `TacpipeError` for options that the scheme does not have, or values that are out of range."""
     if scheme.apart and scheme.name != "kfold":
         raise TacpipeError(
             f"apart {scheme.apart} belongs to the scheme kfold, not to {scheme.name}. "
@@ -202,7 +204,10 @@ def _order(
 def _limit_training(
     roles: Roles, older_roles: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> Roles:
-    """Assign the role ``unused`` to training recordings beyond ``few``; training recordings of an older split are kept."""
+    """Return the role ``unused`` for training recordings beyond ``few``; those of an older split are kept.
+
+    Raises `TacpipeError` if no recording has the value of ``few_of``.
+    """
     attribute, _, value = scheme.few_of.partition("=")
     candidates = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
     if not candidates:
@@ -215,9 +220,9 @@ def _limit_training(
         for group in _sort_naturally(set(groups)):
             trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
             fresh = [name for name in trained if (name, fold) not in older_roles]
-            room = max(scheme.few - (len(trained) - len(fresh)), 0)
+            left_count = max(scheme.few - (len(trained) - len(fresh)), 0)
             order = _order(fresh, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
-            unused |= {(name, fold): UNUSED for name in order[room:]}
+            unused |= {(name, fold): UNUSED for name in order[left_count:]}
     return unused
 
 
@@ -229,6 +234,7 @@ def _draw_validation(
 
 
 def _assign_blocks(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
+    """Return roles in the order of names, stratum by stratum, reversed with ``reverse``."""
     roles: dict[str, str] = {}
     for stratum in _strata(names, attributes, scheme).values():
         order = stratum[::-1] if scheme.reverse else stratum
@@ -236,7 +242,10 @@ def _assign_blocks(names: Sequence[str], attributes: Mapping[str, Attributes], s
     return roles
 
 
-def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> list[dict[str, str]]:
+def _assign_author_roles(
+    names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
+) -> list[dict[str, str]]:
+    """Return the folds of the scheme authors. Raises `TacpipeError` if a recording has no valid ``authors_role``."""
     blocks = sorted({_block(name, attributes) for name in attributes if _has_block(attributes[name])})
     if blocks:
         return _authors_folds(names, attributes, scheme, blocks)
@@ -250,8 +259,9 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
                 f"--authors-role, set it with `tacpipe label`, or choose another scheme."
             )
         roles[name] = str(role)
-    scheme = replace(scheme, val=0) if "val" in roles.values() else scheme
-    return [roles | _draw_validation([name for name in names if roles[name] == "train"], attributes, scheme, 0)]
+    drawn_scheme = replace(scheme, val=0) if "val" in roles.values() else scheme
+    trained = [name for name in names if roles[name] == "train"]
+    return [roles | _draw_validation(trained, attributes, drawn_scheme, 0)]
 
 
 def _authors_folds(
@@ -270,14 +280,14 @@ def _authors_folds(
     )
     folds = []
     for fold in range(len(blocks)):
-        turn = [name for name in names if name not in fixed and part[name] == fold]
+        block_names = [name for name in names if name not in fixed and part[name] == fold]
         remaining = [name for name in names if name not in fixed and part[name] != fold]
         if published:
             trained = _draw_validation(remaining, attributes, replace(scheme, val=0), fold + 1)
-            folds.append(fixed | trained | dict.fromkeys(turn, "val"))
+            folds.append(fixed | trained | dict.fromkeys(block_names, "val"))
         else:
             folds.append(
-                fixed | _draw_validation(remaining, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test")
+                fixed | _draw_validation(remaining, attributes, scheme, fold + 1) | dict.fromkeys(block_names, "test")
             )
     return folds
 
@@ -293,9 +303,10 @@ def _block(name: str, attributes: Mapping[str, Attributes]) -> int:
     return int(block)
 
 
-def _kfold(
+def _assign_folds(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
+    """Return the folds of the scheme kfold, with the values of ``apart`` that each tests; ``keep`` is an older split."""
     part = _assign_parts(names, attributes, scheme, scheme.folds)
     unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
     folds = []
@@ -309,7 +320,10 @@ def _kfold(
 def _assign_parts(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int
 ) -> dict[str, int]:
-    """Assign shuffled recordings to parts in turn, stratum by stratum, so that part sizes differ by at most one."""
+    """Return the part of each recording, from 0; shuffled recordings take turns, stratum by stratum.
+
+    Part sizes differ by at most one.
+    """
     rng = np.random.default_rng(scheme.seed)
     strata = _strata(names, attributes, scheme).values()
     order = itertools.chain.from_iterable([stratum[i] for i in rng.permutation(len(stratum))] for stratum in strata)
@@ -322,6 +336,7 @@ def _unknown(
     """Return the fold in which each recording's value of ``apart`` is unknown.
 
     Values are shuffled, and each is assigned to the fold with the fewest; values of an older split keep their fold.
+    Raises `TacpipeError` if there are fewer values than folds.
     """
     values = {name: _value(name, attributes, scheme.apart) for name in sorted(attributes)}
     distinct = _sort_naturally(set(values.values()))
@@ -340,7 +355,10 @@ def _unknown(
 
 
 def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
-    """Return by value the fold in which an older split tests all of its recordings."""
+    """Return by value the fold in which an older split tests all of its recordings.
+
+    Raises `TacpipeError` if it has no such fold.
+    """
     folds_of: dict[str, set[int]] = {name: set() for name, _ in keep if name in values}
     for (name, fold), role in keep.items():
         if role == "test" and name in folds_of:
@@ -360,7 +378,10 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
 def _leave_one_out(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
-    """Return one fold per value, sorted; values that an older split tested keep their fold."""
+    """Return one fold per value of ``by``, sorted; values that an older split tested keep their fold.
+
+    Raises `TacpipeError` if there is only one value.
+    """
     values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
     old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
     left_out = [old[fold] for fold in sorted(old)]
@@ -403,6 +424,7 @@ def _strata(
 
 
 def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
+    """Return the text of a recording's attribute. Raises `TacpipeError` if it has none."""
     value = attributes[name].get(attribute)
     if value is None:
         labels = sorted(label for label in attributes[name] if not label.startswith(TRUTH))

@@ -104,6 +104,10 @@ class Windows(torch.utils.data.Dataset[Window]):
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
     ) -> None:
+        """Prepare the windows that `Dataset.windows` describes; recordings are decoded when they are needed.
+
+        Raises `UsageError` for invalid options.
+        """
         window_starts(np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride)  # rejects lengths below 1
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
@@ -200,7 +204,10 @@ class Windows(torch.utils.data.Dataset[Window]):
         return [places[name] for name in names]
 
     def _statistics(self) -> Scaling:
-        """Return mean and standard deviation over all rows that are part of a window."""
+        """Return mean and standard deviation over all rows that are part of a window.
+
+        Raises `UsageError` without windows.
+        """
         count, mean, squares = 0, np.zeros(len(self.columns)), np.zeros(len(self.columns))
         for name in self._names:
             rows = self._rows(name)
@@ -221,7 +228,10 @@ class Windows(torch.utils.data.Dataset[Window]):
         return Scaling(mean, np.where(std > 0, std, 1.0))
 
     def _from_other(self, source: Windows) -> Scaling:
-        """Return the scaling of other windows for the channels of these."""
+        """Return the scaling of other windows for the channels of these.
+
+        Raises `UsageError` if they lack a channel or scaling.
+        """
         scaling = source.scaling
         if scaling is None:
             raise UsageError("The windows given as scale are not scaled themselves. Make them with scale=True.")
@@ -244,6 +254,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return self._ends
 
     def _rows(self, name: str) -> _RecordingRows:
+        """Return the rows of a recording, from memory if it was used recently."""
         rows = self._cache.pop(name, None) or self._decode_recording(self.dataset[name])
         self._cache[name] = rows  # moves it to the end as the most recently used
         while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
@@ -251,6 +262,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         return rows
 
     def _decode_recording(self, recording: Recording) -> _RecordingRows:
+        """Return the decoded rows of a recording. Raises `UsageError` if its channels differ from those of the others."""
         table = recording.table(self.stream)
         t_ns = streams.times(table)
         all_columns = arrays.arrays_of_table(table)
@@ -296,7 +308,10 @@ def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: st
 
 
 def _above_rest(table: pa.Table, matrix: arrays.Arrays, t_ns: Int64s, rest_s: float) -> Floats:
-    """Return the channels (time, channel), tactile ones less their median over the first ``rest_s`` seconds."""
+    """Return the channels (time, channel), tactile ones less their median over the first ``rest_s`` seconds.
+
+    Raises `UsageError` if there is no tactile channel.
+    """
     values = matrix.values.astype(np.float64)
     touch = np.isin(matrix.columns, streams.columns_with_quantity(table, TACTILE))  # (channel,)
     if not touch.any():

@@ -139,7 +139,7 @@ class _Place(ABC):
 
     @property
     def root(self) -> Root | None:
-        """The root in the store: the last dataset written to this output."""
+        """The root in the store: the last dataset written to this output, or None."""
         return self.store.roots.get(self.path)
 
     @abstractmethod
@@ -299,7 +299,7 @@ class _Directory(_Place):
             return _with_labels(result, returning_labels)
         appends = replacing.irreplaceable(result) and not self.request.replace
         return _with_labels(
-            replacing.appended(existing, result) if appends else result, {**returning_labels, **existing.labels}
+            replacing.append_manifest(existing, result) if appends else result, {**returning_labels, **existing.labels}
         )
 
     def check(self, result: Manifest) -> None:
@@ -307,7 +307,7 @@ class _Directory(_Place):
         self._refuse_losses(result)
         edited = directory.edited_files(self.store, result, self.path) if result.exported else []
         if edited and not self.request.replace:
-            raise replacing.edited(self.request.output, edited)
+            raise replacing.edited_files_error(self.request.output, edited)
         super().check(result)
 
     def publish(self, result: Manifest, previous: Previous | None = None, key: str = "") -> Manifest:

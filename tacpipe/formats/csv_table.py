@@ -39,7 +39,7 @@ class _NumericTable(TextTable):
         return [*names, ""] if self.trailing_comma and names[-1] else names
 
     def header(self) -> list[str]:
-        """Return the names in the header without the spaces around them."""
+        """Return the names in the header without the spaces around them. Raises `TacpipeError` for an empty file."""
         for _, cells in self.rows():
             return [cell.strip() for cell in cells]
         raise TacpipeError(f"{self.path} is empty; a header and rows were expected. Copy it again from its source.")

@@ -62,7 +62,10 @@ def _check_sender(sender: str, plan: str) -> None:
 
 
 def _restrict_address(place: str, sender: str) -> str:
-    """Return the address of a UDP port that accepts plans from this computer, or from the sender, only."""
+    """Return the address of a UDP port that accepts plans from this computer, or from the sender, only.
+
+    Raises `UsageError` if other computers reach it and no sender is named, or two are.
+    """
     place, _, option = place.partition("?")
     if option and sender:
         raise UsageError(f"--plan-from {excerpt(sender)}: leave ?{plain(option)} of --plan out.")

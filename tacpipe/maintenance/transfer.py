@@ -89,7 +89,7 @@ def push(
         with _announce_read(local_store, dataset.digest) as writable, target.at_work([dataset.digest]):
             owner = projects.identify(local_store, folder, writable=writable)
             if writable:
-                replacing.outgoing(local_store, dataset.directory.absolute())
+                replacing.keep_replaced(local_store, dataset.directory.absolute())
             lock = digest(["pushed", owner.id, name])
             with target.exclusively(lock, f"the pushed dataset {name}"):
                 before = _predecessor(target, local_store, dataset, owner, name, replace=replace)

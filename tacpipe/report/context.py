@@ -270,7 +270,7 @@ class Context:
         return next((method for method in self.methods if method.name == best), None)
 
     def row(self, comparison: Comparison, method: Method | None) -> ComparisonRow | None:
-        """Return the row of a method in a comparison."""
+        """Return the row of a method in a comparison, or None if it has none."""
         return next(
             (row for row in comparison.rows if method and row.method is method and row.name == method.name), None
         )

@@ -63,7 +63,7 @@ def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Arra
 
 
 def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
-    """Return the cells of a text whose cells are separated by spaces or tabs, as `cells` does."""
+    """Return the cells of a text that are separated by spaces or tabs, as `cells` does; None if they cannot be split."""
     data = np.frombuffer(text, np.uint8)
     spaces = np.flatnonzero(data <= SPACES[0])
     without_spaces = text.translate(None, SPACES)

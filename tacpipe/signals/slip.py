@@ -125,6 +125,7 @@ def dropped_online(readings: Floats, rest_rows: int, patch_count: float, saturat
 
 
 def _detect_loss(smooth: Floats, rest_readings: Floats, patch_count: float, saturated_count: float) -> Bools:
+    """Return the rows from the loss of the object on (time,), by the rule of `dropped`; none without readings at rest."""
     if not len(rest_readings):
         return np.zeros(len(smooth), dtype=bool)
     lost = (np.abs(smooth - np.median(rest_readings)) > patch_count) | (smooth <= saturated_count)
@@ -133,6 +134,7 @@ def _detect_loss(smooth: Floats, rest_readings: Floats, patch_count: float, satu
 
 
 def _noise(speed: Floats, limits: SlipLimits) -> float:
+    """Return the root mean square of speeds at rest, or the floor if it is higher."""
     return max(float(np.sqrt(np.mean(speed**2))) if len(speed) else 0.0, limits.noise_floor)
 
 

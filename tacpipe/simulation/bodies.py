@@ -81,8 +81,8 @@ class Box:
         with np.errstate(divide="ignore", invalid="ignore"):
             walls = np.stack([(side * self.half_m - origin_m) / direction for side in (-1, 1)])
         entered = np.nanmax(walls.min(axis=0), axis=1)
-        exit = np.nanmin(walls.max(axis=0), axis=1)
-        return np.where((entered <= exit) & (entered > 0), entered, np.inf)
+        exit_distance = np.nanmin(walls.max(axis=0), axis=1)
+        return np.where((entered <= exit_distance) & (entered > 0), entered, np.inf)
 
     def normal(self, at_m: Floats) -> Floats:
         """Return the normal of the face at each point (point, xyz)."""
@@ -167,20 +167,20 @@ class Frustum:
         return float(np.hypot(max(self.bottom_m, self.top_m), self.half_m))
 
     def hit(self, origin_m: Floats, direction: Floats) -> Floats:
-        """Return the entry distance of rays (ray,): the nearest intersection with the side and the two ends."""
-        origin_m, direction = np.broadcast_arrays(origin_m, direction)
-        radius, growth = self.middle_m + self.slope * origin_m[:, 2], self.slope * direction[:, 2]
-        square = (direction[:, :2] ** 2).sum(axis=1) - growth**2
-        linear = (origin_m[:, :2] * direction[:, :2]).sum(axis=1) - radius * growth
-        constant = (origin_m[:, :2] ** 2).sum(axis=1) - radius**2
+        """Return the entry distance of rays (ray,): the nearest intersection with the side and the two ends, else inf."""
+        start_m, along = np.broadcast_arrays(origin_m, direction)
+        radius, growth = self.middle_m + self.slope * start_m[:, 2], self.slope * along[:, 2]
+        square = (along[:, :2] ** 2).sum(axis=1) - growth**2
+        linear = (start_m[:, :2] * along[:, :2]).sum(axis=1) - radius * growth
+        constant = (start_m[:, :2] ** 2).sum(axis=1) - radius**2
         side = _first_root(square, linear, constant)
         with np.errstate(invalid="ignore"):
-            side[~(np.abs(origin_m[:, 2] + side * direction[:, 2]) <= self.half_m)] = np.inf
+            side[~(np.abs(start_m[:, 2] + side * along[:, 2]) <= self.half_m)] = np.inf
         distance = side
         for height, radius_m in ((-self.half_m, self.bottom_m), (self.half_m, self.top_m)):
             with np.errstate(divide="ignore", invalid="ignore"):
-                end = (height - origin_m[:, 2]) / direction[:, 2]
-                from_axis = np.hypot(*(origin_m[:, :2] + end[:, None] * direction[:, :2]).T)
+                end = (height - start_m[:, 2]) / along[:, 2]
+                from_axis = np.hypot(*(start_m[:, :2] + end[:, None] * along[:, :2]).T)
             distance = np.where((from_axis <= radius_m) & (end > 0) & (end < distance), end, distance)
         return distance
 
@@ -232,8 +232,8 @@ def _first_root(square: Floats, linear: Floats, constant: Floats) -> Floats:
     """Return the smaller positive root of square t^2 + 2 linear t + constant = 0 (ray,), or inf if there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(linear**2 - square * constant)
-        q = -linear - np.where(linear < 0, -root, root)  # avoids cancellation
-        roots = np.stack([q / square, constant / q])
+        stable_root = -linear - np.where(linear < 0, -root, root)  # avoids cancellation
+        roots = np.stack([stable_root / square, constant / stable_root])
     roots[~(roots > 0)] = np.inf
     return np.asarray(roots.min(axis=0))
 
@@ -273,18 +273,18 @@ class Bow:
 
     def hit(self, origin_m: Floats, direction: Floats) -> Floats:
         """Return the distance of the first intersection of rays (ray,), within `CLOSE_M`; inf if there is none."""
-        origin_m, direction = np.broadcast_arrays(origin_m, direction)
-        length = np.linalg.norm(direction, axis=1)
-        unit = direction / length[:, None]
-        nearest = -(origin_m * unit).sum(axis=1)
-        chord2 = self.bound_m**2 - (origin_m**2).sum(axis=1) + nearest**2
+        start_m, along = np.broadcast_arrays(origin_m, direction)
+        length = np.linalg.norm(along, axis=1)
+        unit = along / length[:, None]
+        nearest = -(start_m * unit).sum(axis=1)
+        chord2 = self.bound_m**2 - (start_m**2).sum(axis=1) + nearest**2
         distance = np.full(len(unit), np.inf)
         exits = nearest + np.sqrt(np.maximum(chord2, 0))
         rays = np.flatnonzero((chord2 > 0) & (exits > 0))
         chord = np.sqrt(chord2[rays])
         travelled, limit = np.maximum(nearest[rays] - chord, 0), exits[rays]
         for _ in range(MAX_STEPS):
-            gap = self.distance_m(origin_m[rays] + travelled[:, None] * unit[rays])
+            gap = self.distance_m(start_m[rays] + travelled[:, None] * unit[rays])
             reached = gap < CLOSE_M
             distance[rays[reached]] = travelled[reached]
             travelled = travelled + gap

@@ -53,8 +53,8 @@ def arrivals(true_ns: Times, delay_ns: float, rng: np.random.Generator) -> Times
     Delays are exponentially distributed with mean and standard deviation ``delay_ns``. A link preserves the order, so a late
     sample delays the ones after it.
     """
-    late_ns = np.rint(rng.exponential(delay_ns, len(true_ns))).astype(np.int64)
-    return np.maximum.accumulate(true_ns + late_ns) if len(true_ns) else true_ns
+    delays_ns = np.rint(rng.exponential(delay_ns, len(true_ns))).astype(np.int64)
+    return np.maximum.accumulate(true_ns + delays_ns) if len(true_ns) else true_ns
 
 
 def hold(values: AnyArray, probability: float, rng: np.random.Generator) -> tuple[AnyArray, Bools]:

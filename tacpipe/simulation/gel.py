@@ -178,12 +178,8 @@ def _video(
 def _truth(name: str, states: GelStates, true_ns: Times) -> pa.Table:
     """Return the displacement of each marker and the normal force when each frame was taken."""
     fields: list[Any] = [schema.float_field(f"gt_{name}_normal_n", "N", "force")]
-    fields += [
-        schema.float_field(
-            f"gt_{name}_marker{marker // COLUMNS + 1:02d}{marker % COLUMNS + 1:02d}_{axis}", "px", "position"
-        )
-        for marker in range(ROWS * COLUMNS)
-        for axis in "xy"
-    ]
+    for marker in range(ROWS * COLUMNS):
+        column = f"gt_{name}_marker{marker // COLUMNS + 1:02d}{marker % COLUMNS + 1:02d}"
+        fields += [schema.float_field(f"{column}_{axis}", "px", "position") for axis in "xy"]
     columns = [states.force_n, *states.displacement_px.reshape(len(true_ns), -1).T]
     return schema.stream(true_ns, columns, fields)

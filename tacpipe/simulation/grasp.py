@@ -91,19 +91,18 @@ def truth_table(
     """
     columns = [column for finger in range(len(biotac_sp.FINGERS)) for column in _finger(finger, scene, sensed)]
     columns += [(f"gt_position_{axis}_m", "m", "position", scene.placed.origin_m[i]) for i, axis in enumerate("xyz")]
-    columns += [
-        (f"gt_rotation_{axis}_{part}", "1", "orientation", scene.placed.rotation[i, j])
-        for j, axis in enumerate("xyz")
-        for i, part in enumerate("xyz")
-    ]
+    for j, axis in enumerate("xyz"):
+        rotated = scene.placed.rotation[:, j]
+        columns += [(f"gt_rotation_{axis}_{part}", "1", "orientation", rotated[i]) for i, part in enumerate("xyz")]
     columns += [(f"gt_up_{axis}", "1", "orientation", scene.up[i]) for i, axis in enumerate("xyz")]
     columns.append(("gt_compliance_1_pa", "1/Pa", "compliance", scene.thing.compliance_1_pa))
     for name, unit, estimates in zip(("expected", "variance"), ("count", "count^2"), estimate, strict=True):
-        columns += [
-            (f"gt_{name}_{column}", unit, "tactile", estimates[finger, channel])
-            for finger, short in enumerate(biotac_sp.FINGERS)
-            for channel, column in enumerate(biotac_sp.columns(f"e_{short}") + biotac_sp.columns(f"pdc_{short}"))
-        ]
+        for finger, short in enumerate(biotac_sp.FINGERS):
+            channels = biotac_sp.columns(f"e_{short}") + biotac_sp.columns(f"pdc_{short}")
+            columns += [
+                (f"gt_{name}_{column}", unit, "tactile", estimates[finger, channel])
+                for channel, column in enumerate(channels)
+            ]
     fields = [schema.float_field(name, unit, quantity) for name, unit, quantity, _ in columns]
     moments = [
         pa.field(f"gt_{name}_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"}) for name in moments_ns
@@ -220,6 +219,7 @@ def _noisy_stream(
 
 
 def _attributes(scene: GraspScene, session: int) -> dict[str, Attribute]:
+    """Return the attributes of a grasp: sensor, object, family and the session, which has this number."""
     return {
         "sensor": "biotac-sp",
         "simulated": True,
@@ -230,7 +230,7 @@ def _attributes(scene: GraspScene, session: int) -> dict[str, Attribute]:
 
 
 def _check(rig: GraspRig) -> None:
-    """Raise `TacpipeError` if a rig is invalid."""
+    """Raise `TacpipeError` if a value of a rig is out of range, or ``raw`` and ``spheres`` are both set."""
     if rig.objects < 1:
         raise TacpipeError(f"objects is {rig.objects}; a family needs 1 or more.")
     for name in ("effort_spread", "noise_scale", "drift_count_day"):

@@ -156,10 +156,10 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
         closing = gap / opening[:, None]
     suitable = np.isfinite(opening) & (opening >= OPENING_M[0]) & (opening <= OPENING_M[1])
     for at_m, sign in ((first_m, -1), (second_m, 1)):
-        rows = np.flatnonzero(suitable)
-        along = sign * (placed.normal(at_m[rows]) * closing[rows]).sum(axis=1)
-        suitable[rows] &= (along >= np.cos(CONE_RAD)) & (
-            placed.shape.margin_m(placed.to_body_frame(at_m[rows])) >= MARGIN_M
+        candidates = np.flatnonzero(suitable)
+        along = sign * (placed.normal(at_m[candidates]) * closing[candidates]).sum(axis=1)
+        suitable[candidates] &= (along >= np.cos(CONE_RAD)) & (
+            placed.shape.margin_m(placed.to_body_frame(at_m[candidates])) >= MARGIN_M
         )
     return np.asarray(suitable)
 
@@ -227,7 +227,10 @@ def families(rig: GraspRig) -> tuple[str, ...]:
 
 
 def draw_object(seed: int, index: int, rig: GraspRig = GraspRig()) -> Thing:
-    """Return the object of trial ``index``. With ``rig.spheres``, all trials have the same object."""
+    """Return the object of trial ``index``. With ``rig.spheres``, all trials have the same object.
+
+    Raises `TacpipeError` for an unknown family or stiffness.
+    """
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
         sphere = draw_household_object(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)

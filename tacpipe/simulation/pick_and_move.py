@@ -380,6 +380,7 @@ def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[
 
 
 def _attributes(scene: PickScene, index: int, start_ns: int, rig: PickRig) -> dict[str, Attribute]:
+    """Return the attributes of trial ``index``, which starts at ``start_ns``; times that do not exist are None."""
     contact, grasp = scene.contact, scene.grasp
     is_released = scene.release_ns is not None
     onset = None if is_released else contact.onset

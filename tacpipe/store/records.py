@@ -207,7 +207,7 @@ def parse_record(content: bytes, key: str) -> Record | None:
 
 
 def _after(text: str, start: int, words: str) -> int:
-    """Return where ``text`` continues after ``words``, which must be at ``start``. Raises `ValueError`."""
+    """Return where ``text`` continues after ``words``, which must be at ``start``. Raises `ValueError` if they are not."""
     if not text.startswith(words, start):
         raise ValueError(f"{words} is missing")
     return start + len(words)

@@ -253,7 +253,7 @@ class Store:
         return self._read(name, size)
 
     def _read(self, name: str, size: int | None = None) -> bytes:
-        """Implement `read`."""
+        """Implement `read`, whose errors it raises."""
         try:
             content = self.files.read(layout.object_name(name), None if size is None else read_limit(size))
         except FileNotFoundError:

@@ -211,7 +211,7 @@ class WindowTraining:
         return {"val_loss": float(total) / self.validation.count}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
-        """Return the validation loss."""
+        """Return the validation loss as the only criterion by which epochs are ranked."""
         return {"": (float(line["val_loss"]),)}
 
 

@@ -281,7 +281,7 @@ def read_intervals(path: Path) -> dict[str, dict[str, Attribute]]:
         if not (row["from_s"] or row["to_s"]):
             continue
         try:
-            times.append(intervals.checked(float(row["from_s"]), float(row["to_s"])))
+            times.append(intervals.checked_interval(float(row["from_s"]), float(row["to_s"])))
         except ValueError as error:
             raise UsageError(
                 f"{path}, line {line}: {excerpt(row['from_s'])} to {excerpt(row['to_s'])} is not an interval. Give seconds "

@@ -115,6 +115,7 @@ class Faults:
     wrap_s: float | None = None  # time after the start at which counters wrap
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for a rate below 0 or a probability outside of 0 to 1."""
         for name in ("noise", "cut", "flip", "burst", "stall", "stall_s", "unplug", "unplug_s", "clock_step"):
             if getattr(self, name) < 0:
                 raise UsageError(f"faults: {name} is {getattr(self, name):g}; it must be at least 0.")
@@ -124,7 +125,7 @@ class Faults:
 
 
 def parse(text: str) -> Faults:
-    """Parse the faults of a command line. Raises `UsageError` for an unknown fault or an invalid number.
+    """Return the faults of a command line. Raises `UsageError` for an unknown fault or an invalid number.
 
     >>> parse("noise=0.5,drop=0.01").drop
     0.01
@@ -154,6 +155,7 @@ class Harm:
     """Apply faults to the frames of one stream."""
 
     def __init__(self, faults: Faults, sensor: Sensor, seed: Sequence[int], *, packets: bool) -> None:
+        """Prepare the random events of a sensor's faults from ``seed``; ``packets``: whether the link sends packets."""
         self.faults, self.sensor, self.packets = faults, sensor, packets
         self._rng = np.random.default_rng([*seed, 3])
         rates = (faults.noise, faults.cut, faults.flip, faults.burst, faults.stall, faults.unplug)
@@ -182,6 +184,7 @@ class Harm:
         return items[: len(items) - len(self._delayed)]
 
     def _change_bytes(self, items: list[SentItem], until_ns: int) -> None:
+        """Invert bits, cut frames and insert bursts before ``until_ns``; changes ``items``."""
         for at_ns in self._flip.pop_until(until_ns):
             row = _row(items, at_ns)
             changed = bytearray(items[row].data)
@@ -199,14 +202,20 @@ class Harm:
             self._replace_bytes(items, row, start, int(self._rng.integers(2, MAX_BURST + 1)))
 
     def _replace_bytes(self, items: list[SentItem], row: int, start: int, count: int) -> None:
-        """Replace ``count`` bytes, starting at ``start`` in a frame and continuing in the next ones, by random bytes."""
-        while count > 0 and row < len(items):
-            data = items[row].data
-            size = min(count, len(data) - start)
+        """Replace ``count`` bytes, starting at ``start`` in a frame and continuing in the next ones, by random bytes.
+
+        In packets, only those of the first frame are replaced. Changes ``items``.
+        """
+        first, remaining = start, count
+        for number in range(row, row + 1 if self.packets else len(items)):
+            data = items[number].data
+            size = min(remaining, len(data) - first)
             if size > 0:
                 random = self._rng.integers(0, 256, size, dtype=np.uint8).tobytes()
-                items[row] = items[row]._replace(data=data[:start] + random + data[start + size :], cause=BURST)
-            row, start, count = row + 1, 0, 0 if self.packets else count - size
+                items[number] = items[number]._replace(data=data[:first] + random + data[first + size :], cause=BURST)
+            first, remaining = 0, remaining - size
+            if remaining <= 0:
+                break
 
     def _mark_undetectable(self, items: list[SentItem], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
@@ -214,6 +223,7 @@ class Harm:
                 items[row] = item._replace(invisible=is_undetectable(self.sensor, frames, row, item.data))
 
     def _drop_frames(self, items: list[SentItem]) -> list[SentItem]:
+        """Return the items with random frames dropped."""
         if not self.faults.drop:
             return items
         lost = self._rng.random(len(items)) < self.faults.drop
@@ -240,6 +250,7 @@ class Harm:
         return with_duplicates
 
     def _add_noise(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
+        """Return the items with packets of random bytes before ``until_ns`` between them."""
         noise = []
         for at_ns in self._noise.pop_until(until_ns):
             count = int(self._rng.integers(1, MAX_NOISE + 1))
@@ -248,6 +259,7 @@ class Harm:
         return sorted([*items, *noise], key=lambda item: item.due_ns) if noise else items
 
     def _disconnect(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
+        """Return the items with those of disconnections before ``until_ns`` emptied, and with their starts and ends."""
         away_ns = round(self.faults.unplug_s * 1e9)
         back_ns = self._unplugged[-1][1] if self._unplugged else -1
         events = []
@@ -267,6 +279,7 @@ class Harm:
         return sorted([*remaining, *events], key=lambda item: item.due_ns)
 
     def _delay(self, items: list[SentItem], until_ns: int) -> list[SentItem]:
+        """Return the items with those of pauses before ``until_ns`` delayed to the pause's end."""
         stall_ns = round(self.faults.stall_s * 1e9)
         self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.pop_until(until_ns)]
         if not self._stalls:
@@ -285,7 +298,10 @@ def _row(items: Sequence[SentItem], at_ns: int) -> int:
     low, high = 0, len(items) - 1
     while low < high:
         middle = (low + high) // 2
-        low, high = (middle + 1, high) if items[middle].due_ns < at_ns else (low, middle)
+        if items[middle].due_ns < at_ns:
+            low = middle + 1
+        else:
+            high = middle
     return low
 
 
@@ -298,6 +314,7 @@ class ClockSteps:
     """Clock steps of one size at random times. Calling it returns the total of the steps so far."""
 
     def __init__(self, rate_hz: float, step_ms: float, seed: Sequence[int]) -> None:
+        """Prepare steps forward or backward of ``step_ms`` at a mean rate of ``rate_hz``."""
         self._events = RandomEvents(rate_hz, np.random.default_rng([*seed, 5]))
         self._rng = np.random.default_rng([*seed, 6])
         self._step_ns = round(step_ms * 1e6)

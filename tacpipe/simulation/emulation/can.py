@@ -57,6 +57,7 @@ class VirtualCan:
     """A virtual bus that hosts in this process can join under the same name."""
 
     def __init__(self, sensor: Sensor, channel: str) -> None:
+        """Open the virtual bus ``channel`` of python-can."""
         import can
 
         self.sensor = sensor
@@ -74,7 +75,7 @@ class VirtualCan:
         return []
 
     def look(self) -> list[tuple[BusMember, bytes]]:
-        """Return the CAN frames of hosts."""
+        """Return the CAN frames of hosts, each with the host, as 13 bytes; none while unplugged."""
         heard = []
         while (message := self._bus.recv(0)) is not None:
             identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)

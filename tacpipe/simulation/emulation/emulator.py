@@ -48,7 +48,7 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
 
         return Pty(stream.sensor, _device(folder, stream.name))
     if scheme == "udp":
-        return _udp(stream)
+        return _udp_endpoint(stream)
     if scheme in ("tcp", "tcp+udp"):
         from tacpipe.simulation.emulation.network import Tcp, TcpUdp
 
@@ -80,8 +80,8 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
     )
 
 
-def _udp(stream: RigStream) -> Endpoint:
-    """Return the endpoint of a UDP stream, which sends to a free port if the host listens there."""
+def _udp_endpoint(stream: RigStream) -> Endpoint:
+    """Return a UDP endpoint, which sends to a free port if the sensor's host listens."""
     from tacpipe.simulation.emulation.network import HOST, Udp, free_port
 
     host = stream.address.target.partition("?")[0].rpartition(":")[0]
@@ -119,6 +119,10 @@ class Emulator:
         *,
         patient: bool = False,
     ) -> None:
+        """Prepare a rig; the ``with`` statement starts it. Without a ``folder`` it uses a temporary one.
+
+        If ``patient``, streams wait instead of losing bytes while a host's buffer is full.
+        """
         self.patient = patient
         self.rig_file, self.seed, self.faults = rig, seed, faults or Faults()
         self.folder = folder or Path()
@@ -141,6 +145,7 @@ class Emulator:
         return replace(self.rig_file, streams=streams, labels={**self.rig_file.labels, "simulated": True})
 
     def __enter__(self) -> Self:
+        """Start all streams. Raises `DeviceError` or `UsageError` if one cannot be emulated."""
         paces = {name: frame_pace(self.rig_file, name) for name in self.rig_file.streams}
         with contextlib.ExitStack() as resources:
             if self._temporary:
@@ -153,7 +158,7 @@ class Emulator:
             self._resources = resources.pop_all()
         self.epoch_ns = time.monotonic_ns()
         for name, stream in self.rig_file.streams.items():
-            self._transmissions[name] = self._transmission(stream, paces[name], endpoints[name])
+            self._transmissions[name] = self._create_transmission(stream, paces[name], endpoints[name])
         self._threads = [
             threading.Thread(target=self._run_thread, args=(work,), daemon=True)
             for work in (self._send_due, self._fill)
@@ -165,6 +170,7 @@ class Emulator:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Stop all streams. Raises an error of their threads."""
         self._stopped.set()
         for thread in self._threads:
             thread.join()
@@ -173,6 +179,7 @@ class Emulator:
             raise self._errors[0]
 
     def _run_thread(self, work: Callable[[], None]) -> None:
+        """Do the work of a thread; store its error and stop the others."""
         try:
             work()
         except BaseException as error:  # the ``with`` statement raises errors of the thread
@@ -187,7 +194,8 @@ class Emulator:
         """Plug the device of a stream in again, at the same address."""
         self._commands.append((name, True))
 
-    def _transmission(self, stream: RigStream, stream_pace: FramePace, endpoint: Endpoint) -> Transmission:
+    def _create_transmission(self, stream: RigStream, stream_pace: FramePace, endpoint: Endpoint) -> Transmission:
+        """Return the transmission of a stream to the hosts of ``endpoint``."""
         packets = stream.address.scheme in PACKETS
         rate_hz = stream.sensor.rate_hz or (CAMERA_HZ if isinstance(stream.sensor, Camera) else DEFAULT_HZ)
 
@@ -232,16 +240,15 @@ class Emulator:
                 transmission.fill(time.monotonic_ns() - self.epoch_ns)
 
     def _send_due(self) -> None:
+        """Send due items and receive what hosts write until the emulator is stopped; the work of a thread."""
         transmissions = list(self._transmissions.values())
         owners: dict[int, Transmission] = {}  # transmissions by descriptor
         poll_ns, changed = 0, True
         while not self._stopped.is_set():
             if changed:
-                owners = {
-                    number: transmission
-                    for transmission in transmissions
-                    for number in transmission.endpoint.descriptors()
-                }
+                owners = {}
+                for transmission in transmissions:
+                    owners |= dict.fromkeys(transmission.endpoint.descriptors(), transmission)
             now_ns = time.monotonic_ns()
             next_ns = min([transmission.next_ns for transmission in transmissions])
             wait_s = min(MAX_WAIT_S, max(0.0, (next_ns - now_ns) / 1e9))

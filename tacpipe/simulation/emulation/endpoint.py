@@ -61,9 +61,9 @@ def sent_sizes(sizes: Sequence[int], sent: int) -> list[int]:
     """
     parts = []
     for size in sizes:
-        part = min(size, sent)
-        parts.append(part)
-        sent -= part
+        sent_bytes = min(size, sent)
+        parts.append(sent_bytes)
+        sent -= sent_bytes
     return parts
 
 

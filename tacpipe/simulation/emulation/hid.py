@@ -33,6 +33,7 @@ class Server:
     """The umockdev process of an emulator's folder, with its devices."""
 
     def __init__(self, folder: Path) -> None:
+        """Start the server. Raises `DeviceError` if umockdev is not installed or does not start."""
         if shutil.which("umockdev-wrapper") is None or not Path(SYSTEM_PYTHON).exists():
             raise DeviceError(
                 "HID devices are emulated by umockdev, which is not installed. Install umockdev, gir1.2-umockdev-1.0 and "
@@ -44,7 +45,7 @@ class Server:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
-        self.root = self.line().decode()
+        self.root = self.read_line().decode()
         if not self.root:
             assert self.process.stderr is not None
             message = self.process.stderr.read().decode().strip().splitlines()[-1:]
@@ -56,8 +57,8 @@ class Server:
         self.devices: list[Hid] = []
         self._pending = b""
 
-    def line(self) -> bytes:
-        """Wait for the next line of the server and return it."""
+    def read_line(self) -> bytes:
+        """Wait for the next line of the server and return it; empty when the server has ended."""
         assert self.process.stdout is not None
         line = b""
         while not line.endswith(b"\n"):
@@ -111,6 +112,7 @@ class Hid:
     """A HID device."""
 
     def __init__(self, sensor: Sensor, address: Address, folder: Path) -> None:
+        """Add a device to the server of ``folder``, which is started if there is none."""
         if folder not in _servers:
             _servers[folder] = Server(folder)
         self.sensor, self.address, self._folder = sensor, address, folder
@@ -122,7 +124,7 @@ class Hid:
         vendor, _, product = usb_id.lower().partition(":")
         descriptor = bytes.fromhex(DESCRIPTORS.get(usb_id.lower(), RAW)).hex()
         self.server.send(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
-        self.server.line()
+        self.server.read_line()
         self._unplugged = False
         self.peers = [Host(self)]
 

@@ -42,7 +42,7 @@ def describe_device(number: int, vendor: str, product: str, descriptor: str, nam
 def ioctl_handler(descriptor: bytes) -> Any:
     """Return a handler of the ioctl requests for a report descriptor."""
 
-    def answer(_: Any, client: Any) -> bool:
+    def answer_request(_: Any, client: Any) -> bool:
         request = client.get_request()
         if request == GET_SIZE:
             client.get_arg().resolve(0, 4).update(0, len(descriptor).to_bytes(4, "little"))
@@ -53,7 +53,7 @@ def ioctl_handler(descriptor: bytes) -> Any:
         client.complete(0, 0)
         return True
 
-    return answer
+    return answer_request
 
 
 def print_reports(number: int, board: int) -> None:
@@ -84,7 +84,7 @@ def append_report(board: int, buffered: bytes, report: bytes) -> bytes:
 
 
 def serve(mock: Any, testbed: Any, loop: Any) -> None:
-    """Run the commands from standard input."""
+    """Run the commands from standard input: add a device, or send a report of one."""
     boards: dict[str, int] = {}
     unsent: dict[str, bytes] = {}
     handlers = []

@@ -62,6 +62,7 @@ class CameraSource(Sampled):
     def __init__(
         self, sensor: Camera, world: World, timing: Timing, seed: Sequence[int], finger: int, video: str
     ) -> None:
+        """Create the source of a camera that shows the images of ``video``, or without one the gel of ``finger`` 0 or 1."""
         super().__init__(sensor, timing)
         self.world, self.finger = world, finger
         self._format = jpeg_format(sensor.width_px, sensor.height_px, None, sensor.pixel_format)
@@ -69,6 +70,7 @@ class CameraSource(Sampled):
         self._camera = gel.GelCamera(np.random.default_rng([*seed, 1]))
 
     def _generate(self, block: int) -> Samples:
+        """Return the images of a block with the times that the server's clock gives them."""
         numbers = self.numbers(block)
         taken_ns = self.timing.sample_ns(numbers)
         packets = np.empty((len(numbers), 1), object)
@@ -89,12 +91,12 @@ def gel_states(world: World, finger: int, t_ns: Int64s) -> gel.GelStates:
     """Return the states of the gel of finger 0 or 1 of the rig's world at ``t_ns`` (time,)."""
     sigma_px = world.skins[finger].sigma_m * gel.PX_M
 
-    def look(cycle: Cycle, local_ns: Int64s) -> Floats:
+    def read_states(cycle: Cycle, local_ns: Int64s) -> Floats:
         states = gel.gel_states(cycle.scene, finger, local_ns)
         moved_px = states.displacement_px.reshape(len(local_ns), -1)
         return np.column_stack([moved_px, states.force_n, states.centre_px])
 
-    joined = world.at(t_ns, look)
+    joined = world.at(t_ns, read_states)
     return gel.GelStates(joined[:, :-3].reshape(len(t_ns), -1, 2), joined[:, -3], joined[:, -2:], sigma_px)
 
 
@@ -150,7 +152,7 @@ class HttpCamera(Tcp):
         self.address = Address("mjpeg", f"http://{HOST}:{self._port}{PATH}")
 
     def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
-        """Answer a request; return an empty message for a host that gets images from now on."""
+        """Answer a request for images; return the host with an empty message if it now gets images, else nothing."""
         assert isinstance(peer, Viewer)
         if peer.is_open:
             return []

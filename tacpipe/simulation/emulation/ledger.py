@@ -83,6 +83,7 @@ class Ledger:
     """The sent items and the events of one stream, in order."""
 
     def __init__(self, name: str) -> None:
+        """Start an empty ledger of the stream ``name``."""
         self.name = name
         self.sources: list[Sampled] = []
         self.events: list[tuple[int, str, str]] = []  # time on the monotonic clock in ns, event, detail
@@ -147,16 +148,16 @@ class Ledger:
 
         They are generated again from the source, encoded and decoded. ``rows`` has the index of the entry of each sample.
         """
-        rows = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
+        entries = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
         sensor = self.sources[-1].sensor
-        parts = [decode_frames(sensor, sensor.encode(part)) for part in self._parts(rows)]
+        parts = [decode_frames(sensor, sensor.encode(part)) for part in self._parts(entries)]
         return concatenate(parts)
 
     def frames(self, rows: Sequence[int] | Int64s | None = None) -> list[bytes]:
         """Return the frames of entries without faults, by default of all `intact_rows`."""
-        rows = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
+        entries = self.intact_rows if rows is None else np.asarray(rows, dtype=np.int64)
         frames: list[bytes] = []
-        for part in self._parts(rows):
+        for part in self._parts(entries):
             sensor = self.sources[-1].sensor
             frames += split_frames(sensor, sensor.encode(part))
         return frames
@@ -239,7 +240,10 @@ def recorded_columns(table: pa.Table) -> list[AnyArray]:
 
 
 def keys(columns: Sequence[AnyArray]) -> list[bytes]:
-    """Return all values of each sample as bytes (sample,); of texts their hash, good within one process."""
+    """Return all values of each sample as bytes (sample,), by which samples can be compared within one process.
+
+    Texts are represented by their hashes.
+    """
     texts = [column for column in columns if column.dtype.kind == "O"]
     parts = [column for column in columns if column.dtype.kind != "O"]
     parts += [np.array([hash(str(cell)) for cell in column.tolist()]) for column in texts]
@@ -257,8 +261,8 @@ def start_of(table: pa.Table, samples: Samples) -> int | None:
     for start in np.flatnonzero(samples.seq == table.column("seq")[0].as_py()).tolist():
         stop = start + table.num_rows
         if all(
-            np.array_equal(ours, theirs[start:stop], equal_nan=True)
-            for ours, theirs in zip(recorded, sent, strict=True)
+            np.array_equal(recorded_column, sent_column[start:stop], equal_nan=True)
+            for recorded_column, sent_column in zip(recorded, sent, strict=True)
         ):
             return int(start)
     return None

@@ -26,6 +26,7 @@ class Connection:
     """A connected host."""
 
     def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+        """Use an accepted connection of a host without blocking."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.socket, self.device = connection, sensor.device()
@@ -49,6 +50,7 @@ class Connection:
         return [size if part else 0 for size, part in zip(sizes, parts, strict=True)]
 
     def _send_some(self, data: bytes) -> int:
+        """Send some bytes and return their number; 0 if the host does not read or has disconnected."""
         try:
             return self.socket.send(data)
         except BlockingIOError:
@@ -103,6 +105,7 @@ class Tcp:
     kind: type[Connection] = Connection
 
     def __init__(self, sensor: Sensor) -> None:
+        """Start a server on a free port."""
         self.sensor = sensor
         self.peers: list[Connection] = []
         self._server: socket.socket | None = None
@@ -140,7 +143,7 @@ class Tcp:
         return listening + [peer.socket.fileno() for peer in self.peers]
 
     def ready(self, descriptor: int) -> list[tuple[Connection, bytes]]:
-        """Accept a connection, or return the bytes from a host."""
+        """Accept a connection, or read from a host; return each host with its bytes, which are empty if it is new."""
         if self._server is not None and descriptor == self._server.fileno():
             try:
                 peer = self.kind(self._server.accept()[0], self.sensor)
@@ -154,6 +157,7 @@ class Tcp:
         return []
 
     def _receive(self, peer: Connection) -> list[tuple[Connection, bytes]]:
+        """Return a host with the bytes from it; nothing if it has disconnected."""
         data = peer.read()
         if data is None:
             self.leave(peer)
@@ -181,6 +185,7 @@ class Client(Connection):
     """A host that is connected, or in the websocket handshake."""
 
     def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+        """Use an accepted connection for websocket messages, once its handshake is done."""
         from websockets.server import ServerProtocol
 
         super().__init__(connection, sensor)
@@ -196,6 +201,7 @@ class Client(Connection):
         return [len(piece) if part else 0 for piece, part in zip(pieces, sent, strict=True)]
 
     def _message(self, piece: bytes) -> bytes:
+        """Return a piece as a websocket message, binary if it is not valid text."""
         try:
             piece.decode()
         except UnicodeDecodeError:
@@ -216,7 +222,7 @@ class Websocket(Tcp):
         super().__init__(sensor)
 
     def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
-        """Return the messages from the host, and an empty one for a new connection. Answers handshakes and pings."""
+        """Return each host's messages, and an empty one for a new connection. Answers handshakes and pings."""
         from websockets.frames import Opcode
         from websockets.http11 import Request
 
@@ -270,6 +276,7 @@ class Udp:
     """A UDP port of a device."""
 
     def __init__(self, sensor: Sensor, listener: tuple[str, int] | None = None) -> None:
+        """Open a UDP port; datagrams are sent to ``listener`` (host, port), or without one to whoever writes first."""
         self.sensor = sensor
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
@@ -286,7 +293,7 @@ class Udp:
         return [self._socket.fileno()]
 
     def ready(self, descriptor: int) -> list[tuple[Correspondent, bytes]]:
-        """Return the received datagram. Its sender receives the datagrams from now on."""
+        """Return the sender and a received datagram; nothing if there is none. It receives the datagrams from now on."""
         try:
             data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
         except OSError:  # no datagram, or a refusal of a sent one

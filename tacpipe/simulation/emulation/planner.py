@@ -19,7 +19,7 @@ def send_plans(emulator: Emulator, port: int, rate_hz: float) -> Iterator[None]:
     is_over = threading.Event()
     offset_ns = time.time_ns() - time.monotonic_ns()
 
-    def send() -> None:
+    def send_repeatedly() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
             while not is_over.wait(1 / rate_hz):
                 since_ns = time.monotonic_ns() - emulator.epoch_ns
@@ -28,7 +28,7 @@ def send_plans(emulator: Emulator, port: int, rate_hz: float) -> Iterator[None]:
                 packet = plan.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses)
                 controller.sendto(packet, ("127.0.0.1", port))
 
-    controller = threading.Thread(target=send, daemon=True)
+    controller = threading.Thread(target=send_repeatedly, daemon=True)
     controller.start()
     try:
         yield

@@ -72,11 +72,8 @@ class SensorView:
 
 def compute(quantity: str, view: SensorView, fields: Sequence[pa.Field]) -> Floats:
     """Return the values of fields of one quantity (time, field) in SI units; zeros if the quantity is not simulated."""
-    function = (
-        QUANTITIES.get(quantity)
-        if not metadata_of(fields[0], "taxel") or quantity not in ("force", "torque")
-        else _tactile
-    )
+    of_taxel = metadata_of(fields[0], "taxel") and quantity in ("force", "torque")
+    function = _tactile if of_taxel else QUANTITIES.get(quantity)
     return function(view, fields) if function else np.zeros((len(view.t_ns), len(fields)))
 
 
@@ -181,6 +178,8 @@ def _acceleration(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
 
 
 def _angular_velocity(view: SensorView, fields: Sequence[pa.Field]) -> Floats:
+    """Return the angular velocity (time, field) of the hand in rad/s, which turns only around z."""
+
     def yaw(t_ns: Times) -> Floats:
         return view.world.contact(t_ns, lambda scene: scene.path.yaw_rad)[:, None]
 
@@ -290,19 +289,24 @@ def to_device_units(
 
 
 def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyArray:
+    """Return values (time,) in SI units in the unit and type of a field.
+
+    Quantities without a unit are counts, of which ``full`` in SI units is the full range. Integers are rounded and
+    clipped.
+    """
     kind = np.dtype(field.type.to_pandas_dtype())
     scale = unit_scale(metadata_of(field, "unit") or "1")
     if scale is None and quantity in FULL:
         full_scale = COUNTS.get(kind.name, FLOAT_COUNTS)
         # signed values in an unsigned type
         offset = full_scale if kind.kind == "u" and axis_of(field) in ("x", "y") else 0.0
-        values = offset + values * (full_scale / full)
+        scaled = offset + values * (full_scale / full)
     else:
-        values = values * (scale or 1.0)
+        scaled = values * (scale or 1.0)
     if kind.kind in "iu":
         limits = np.iinfo(kind)
-        values = np.rint(values).clip(limits.min, limits.max)
-    column: AnyArray = values.astype(kind)
+        scaled = np.rint(scaled).clip(limits.min, limits.max)
+    column: AnyArray = scaled.astype(kind)
     return column
 
 

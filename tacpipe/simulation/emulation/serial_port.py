@@ -79,6 +79,7 @@ class Pty:
     """The device's end of a serial port."""
 
     def __init__(self, sensor: Sensor, link: Path) -> None:
+        """Create the pseudo-terminal of a sensor at the path ``link``. Raises `UsageError` if the path is in use."""
         self.sensor, self.link = sensor, link
         self.address = Address("serial", str(link))
         self.peers: list[HostPort] = []
@@ -122,7 +123,7 @@ class Pty:
         return [self._master] if self.peers else []
 
     def ready(self, descriptor: int) -> list[tuple[HostPort, bytes]]:
-        """Return the bytes from the host."""
+        """Return the host with the bytes from it, garbled at a wrong baud rate; nothing if there are none."""
         try:
             data = os.read(self._master, MAX_READ_BYTES)
         except BlockingIOError:
@@ -135,7 +136,7 @@ class Pty:
         return [(self._port, heard) for heard in self.from_wire(data)]
 
     def look(self) -> list[tuple[HostPort, bytes]]:
-        """Check whether a host has opened the port."""
+        """Return the host with an empty message if it has just opened the port, else nothing."""
         if self._master < 0 or self.peers:
             return []
         poll = select.poll()

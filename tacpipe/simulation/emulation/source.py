@@ -90,6 +90,7 @@ class SampleSource(Sampled):
     def __init__(
         self, sensor: Sensor, world: World, timing: Timing, seed: Sequence[int] = (0,), finger: int = 0
     ) -> None:
+        """Create the source of a sensor on ``finger`` (0 or 1) of the world."""
         super().__init__(sensor, timing)
         self.world, self.finger = world, finger
         self.fields = sensor.fields()
@@ -104,6 +105,7 @@ class SampleSource(Sampled):
         ]
 
     def _generate(self, block: int) -> Samples:
+        """Return the samples of a block: the values of all fields, counters and the device's times."""
         numbers = self.numbers(block)
         sample_ns = self.timing.sample_ns(numbers)
         rng = np.random.default_rng([*self._seed, 1, block])
@@ -217,12 +219,13 @@ class CloudSource(Sampled):
         self._coloured = len(sensor.fields()) > 3
 
     def _generate(self, block: int) -> Samples:
-        points, colours = zip(*(self._view(int(number)) for number in self.numbers(block)), strict=True)
+        points, colours = zip(*(self._generate_cloud(int(number)) for number in self.numbers(block)), strict=True)
         rows = np.repeat(np.arange(self.rows, dtype=np.int64), [len(cloud) for cloud in points])
         values = (np.concatenate(points), np.concatenate(colours)) if self._coloured else (np.concatenate(points),)
         return Samples(values, rows=rows)
 
-    def _view(self, number: int) -> tuple[Float32s, Bytes]:
+    def _generate_cloud(self, number: int) -> tuple[Float32s, Bytes]:
+        """Return points (point, xyz) in m and colours (point, rgb) of the cloud with this number."""
         scene = grasp_scene.perform(self._seed, number)
         neighbour = grasp_scene.draw_object(self._seed, number + 1)
         rng = np.random.default_rng([self._seed, 9, number])
@@ -251,6 +254,7 @@ class SlideSource(Sampled):
         self._trial = functools.lru_cache(CACHED_TRIALS)(self._readings)
 
     def _generate(self, block: int) -> Samples:
+        """Return the samples of a block: the rows of successive trials, the same for all fingers."""
         numbers = self.numbers(block)
         while self._ends[-1] <= numbers[-1]:
             self._ends.append(self._ends[-1] + len(self._trial(len(self._ends) - 1)))

@@ -35,6 +35,7 @@ class FramePace:
     finger: int | None = None  # finger with the sensor, 1 or 2; None: the last digit of the stream's name, or 1
 
     def __post_init__(self) -> None:
+        """Raise `UsageError` for a negative delay or burst, or a finger that does not exist."""
         if self.jitter_ms < 0 or self.burst_ms < 0:
             raise UsageError(
                 f"emulate: jitter_ms is {self.jitter_ms:g} and burst_ms {self.burst_ms:g}; both must be at least 0."
@@ -46,9 +47,9 @@ class FramePace:
 def next_due_ns(sample_ns: Times, pace: FramePace, after_ns: int, rng: np.random.Generator) -> Times:
     """Return the ascending due times (frame,) in ns of frames with samples at ``sample_ns``, not before ``after_ns``."""
     late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(sample_ns))).astype(np.int64)
-    due = np.maximum(np.maximum.accumulate(sample_ns + late_ns), after_ns)
+    arrival_ns = np.maximum(np.maximum.accumulate(sample_ns + late_ns), after_ns)
     burst_ns = round(pace.burst_ms * 1e6)
-    burst_due_ns: Times = -(-due // burst_ns) * burst_ns if burst_ns else due
+    burst_due_ns: Times = -(-arrival_ns // burst_ns) * burst_ns if burst_ns else arrival_ns
     return burst_due_ns
 
 
@@ -62,6 +63,7 @@ class TransmissionPlan:
     """The items of a stream in order, with due times and faults, in blocks of its source."""
 
     def __init__(self, source: Sampled, pace: FramePace, faults: Faults, seed: Sequence[int], *, packets: bool) -> None:
+        """Plan frames of ``source`` with faults; ``packets``: whether the link sends packets."""
         self.source, self.pace = source, pace
         self._harm = Harm(faults, source.sensor, seed, packets=packets)
         self._rng = np.random.default_rng([*seed, 7])
@@ -73,7 +75,7 @@ class TransmissionPlan:
         self._block = max(self._block, self.source.timing.first_after(t_ns) // self.source.rows)
 
     def next_items(self) -> list[SentItem]:
-        """Return the items of the next block."""
+        """Return the items of the next block, with faults."""
         source = self.source
         numbers = source.numbers(self._block)
         frames = split_frames(source.sensor, source.sensor.encode(source.block(self._block)))
@@ -97,6 +99,7 @@ class Transmission:
         *,
         patient: bool = False,  # wait, instead of losing bytes, while a host's buffer is full
     ) -> None:
+        """Start a plan at ``rate_hz``. ``epoch_ns`` is the rig's start on the monotonic clock."""
         self._patient = patient
         # items, or None for replies, and their unsent bytes
         self._unsent: deque[tuple[SentItem | None, bytes]] = deque()
@@ -112,6 +115,7 @@ class Transmission:
         self._start_plan(rate_hz, 0)
 
     def _start_plan(self, rate_hz: float, start_ns: int) -> None:
+        """Replace the plan by one with another rate that starts at ``start_ns`` since the rig's start, and fill it."""
         plan = self._make_plan(rate_hz, start_ns)
         with self._lock:
             self._rate_hz, self._plan, self._latest = rate_hz, plan, None
@@ -167,6 +171,7 @@ class Transmission:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
 
     def _send(self, items: Sequence[SentItem], now_ns: int) -> None:
+        """Send items to all hosts, and add them to the ledger with what the first of them accepted."""
         if not items:
             return
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
@@ -213,6 +218,7 @@ class Transmission:
         self._retry_ns = now_ns + RETRY_NS
 
     def _add_to_ledger(self, items: Iterable[SentItem], sizes: Sequence[int], fault: str, now_ns: int) -> None:
+        """Add items with their sent ``sizes``, and as their cause what their host did if it did not take all bytes."""
         for item, size in zip(items, sizes, strict=True):
             cause = item.cause
             if size < len(item.data):

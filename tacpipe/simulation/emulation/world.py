@@ -149,6 +149,7 @@ class World:
         return self._cycle(number)
 
     def _generate(self, number: int) -> Cycle:
+        """Return the cycle with this number: a trial and the return to its start."""
         scene = replace(pick_and_move.perform(self._seed, number, self._rig), skins=self.skins)
         full_scene = with_return(scene)
         return Cycle(
@@ -157,10 +158,11 @@ class World:
 
     def at(self, t_ns: Times, value: Callable[[Cycle, Times], Floats]) -> Floats:
         """Return values (time, …) at ascending ``t_ns`` (time,). ``value`` computes them from a cycle and its times."""
-        t_ns = np.maximum(t_ns - self.idle_ns, 0)
-        numbers = t_ns // CYCLE_NS
+        since_ns = np.maximum(t_ns - self.idle_ns, 0)
+        numbers = since_ns // CYCLE_NS
         parts = [
-            value(self.cycle(int(number)), t_ns[numbers == number] - number * CYCLE_NS) for number in np.unique(numbers)
+            value(self.cycle(int(number)), since_ns[numbers == number] - number * CYCLE_NS)
+            for number in np.unique(numbers)
         ]
         return np.concatenate(parts)
 

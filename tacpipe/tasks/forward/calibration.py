@@ -59,7 +59,7 @@ def calibrate(
 
 
 def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
-    """Raise an error for calibration recordings that were used for training, early stopping or shrinkage."""
+    """Raise `UsageError` for calibration recordings that were used for training, early stopping or shrinkage."""
     digests = set(forecaster.config["trained_on"].values())
     used = sorted(name for name, shard in calibration.recordings.items() if shard.digest in digests)
     if used:
@@ -70,7 +70,10 @@ def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
 
 
 def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> WindowErrors:
-    """Return the model's errors on at most ``limit`` evenly spread windows of each recording."""
+    """Return the model's errors on at most ``limit`` evenly spread windows of each recording.
+
+    Raises `TacpipeError` if the recordings do not fit the model or contain no window.
+    """
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
     with terminal.progress_bar("calibrate", len(recordings.recordings)) as advance:

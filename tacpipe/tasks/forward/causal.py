@@ -29,7 +29,8 @@ class Arm:
     def __init__(self, orientation: AnyFloats) -> None:
         """Start before the first row; ``orientation`` (4,) is the quaternion that defines the sign in recordings."""
         self._reference = orientation
-        self._sign, self._opposite = 1.0, None if orientation is None else False
+        self._sign = 1.0
+        self._opposite = None if orientation is None else False
         self._decided = False
         self._unit: Floats | None = None  # (1, 4), previous quaternion as received
         self._before: tuple[int, Floats] | None = None  # time and pose (7,) of the previous row
@@ -44,10 +45,11 @@ class Arm:
         angles: Floats | None = None,
         speeds: Floats | None = None,
     ) -> Float32s:
-        """Return the arm (13,) in a row: position (3,), quaternion (4,), and optionally joint angles and speeds (7,).
+        """Return the arm (13,) in a row: position (3,), quaternion (4,), velocity (3,) and angular velocity (3,).
 
-        Velocities come from the joints of a known arm while the hand keeps its initial position on the last link.
-        Otherwise they are differences from the previous row.
+        ``angles`` and ``speeds`` are of the joints (7,), None if they are not recorded. Velocities come from the joints
+        of a known arm while the hand keeps its initial position on the last link. Otherwise they are differences from
+        the previous row.
         """
         placed = np.concatenate([position_m, self._continuous(quaternion)])
         moved = None if angles is None or speeds is None else self._joint_velocity(angles, speeds, position_m)
@@ -71,6 +73,7 @@ class Arm:
         return continuous
 
     def _finite_difference_velocity(self, t_ns: int, placed: Floats) -> Floats:
+        """Return velocity and angular velocity (6,) from the difference to the previous row; 0 in the first row."""
         if self._before is None:
             return np.zeros(6)
         before_ns, before = self._before
@@ -79,6 +82,7 @@ class Arm:
         return velocity
 
     def _joint_velocity(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
+        """Return velocity and angular velocity (6,) from the joints; None once the hand has moved on the last link."""
         if not self._carried:
             return None
         frames = kinematics.joint_frames(kinematics.PANDA, angles[None])
@@ -153,7 +157,10 @@ class Rolling:
         finite = bool(np.isfinite(level).all() and np.isfinite(latent).all() and np.isfinite(arm).all())
         finite = finite and bool(np.isfinite(finger))
         is_decided = self._rows > self._unknown
-        self._run = (self._run + 1 if follows else 1) if usable and finite and is_decided else 0
+        if not (usable and finite and is_decided):
+            self._run = 0
+        else:
+            self._run = self._run + 1 if follows else 1
         return finite
 
     def predict(self, plan: AnyFloats) -> Float32s:

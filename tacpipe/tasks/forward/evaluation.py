@@ -56,7 +56,7 @@ class QuantileSums:
     examples: list[dict[str, str | int | list[float]]] = field(default_factory=list)  # see `_Drawn.example`
 
     def add(self, track: Track, trial: Trial) -> None:
-        """Add the windows of a recording."""
+        """Add the windows of a recording; nothing if the model has no quantiles."""
         forecaster = self.forecaster
         uncertainty = forecaster.quantiles
         if uncertainty is None:
@@ -89,15 +89,15 @@ class QuantileSums:
         return QuantileMetrics(described, self._measures(fresh, uncertainty.percents) if fresh else {}, measures)
 
     def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
+        """Return the measures of each predictor by step, with intervals over recordings, or unseen objects."""
         # sums by predictor, by unit of the interval (recording, or unseen object)
         sums_by_unit: dict[str, dict[str, Sums]] = {}
         for trial in trials:
-            sums, unit = self.sums[trial.name], trial.name if trial.known else str(trial.object)
-            sums_by_unit[unit] = (
-                {name: sums_by_unit[unit][name] + unit_sums for name, unit_sums in sums.items()}
-                if unit in sums_by_unit
-                else sums
-            )
+            sums = self.sums[trial.name]
+            unit = trial.name if trial.known else str(trial.object)
+            if unit in sums_by_unit:
+                sums = {name: sums_by_unit[unit][name] + added for name, added in sums.items()}
+            sums_by_unit[unit] = sums
         unit_sums = list(sums_by_unit.values())
         persistence = [sums[BASELINE] for sums in unit_sums]
         return {
@@ -106,16 +106,29 @@ class QuantileSums:
         }
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:
-        """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw."""
+        """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw.
+
+        Empty if the model has no quantiles.
+        """
         if self.forecaster.quantiles is None:
             return {}
         rows = []
         for trial in trials:
             about = {name: getattr(trial, name) for name in ("object", "known", "seen")}
             for predictor, sums in self.sums.get(trial.name, {}).items():
-                for at, values in enumerate(sums.values):
-                    row = {"recording": trial.name, **about, "predictor": predictor, "step": at + 1, "values": values}
-                    row |= {"covered": sums.covered[at], "width": sums.width[at], "pinball": sums.pinball[at].mean()}
+                for index, values in enumerate(sums.values):
+                    row = {
+                        "recording": trial.name,
+                        **about,
+                        "predictor": predictor,
+                        "step": index + 1,
+                        "values": values,
+                    }
+                    row |= {
+                        "covered": sums.covered[index],
+                        "width": sums.width[index],
+                        "pinball": sums.pinball[index].mean(),
+                    }
                     rows.append(row)
         drawn = (json.dumps(self.examples) + "\n").encode()
         return {COVERAGE_FILE: to_parquet(pa.Table.from_pylist(rows, _COLUMNS)), EXAMPLES: drawn}
@@ -157,6 +170,7 @@ class _Drawn:
     """The forecast of a recording's most active channel, with its band."""
 
     def __init__(self, forecaster: Forecaster, track: Track) -> None:
+        """Draw the channel of ``track`` whose signal varies most, `STEP` steps ahead or at the model's last step."""
         self._step = min(STEP, forecaster.horizon)
         self._channel = (
             int(np.argmax(track.tactile[np.flatnonzero(track.usable)].std(axis=0))) if len(track.t_ns) else 0
@@ -170,7 +184,7 @@ class _Drawn:
         self._rows += zip(self._t_ns[now + self._step] / 1e9, truth[at], *predicted[at].T, strict=True)
 
     def example(self, percents: Sequence[int]) -> dict[str, str | int | list[float]]:
-        """Return the curves: time in s, measured values, and each quantile."""
+        """Return recording, channel and step, and the curves: time in s, measured values, and each quantile."""
         columns = np.array(self._rows[:MAX_ROWS]).T
         names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
         return {
@@ -285,17 +299,17 @@ def _prediction_table(
 
 
 def check_rate(track: Track, forecaster: Forecaster) -> None:
-    """Raise an error if a track's grid is not the one that the model was trained on."""
+    """Raise `TacpipeError` if a track's grid is not the one that the model was trained on."""
     trained, rate_hz = forecaster.config["timeline"], float(forecaster.config["rate_hz"])
-    option = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
+    required_option = f"--rate-hz {rate_hz:g}" if trained == "uniform" else f"--grid {trained}"
     if track.timeline != trained:
         raise TacpipeError(
             f"{track.name} has a {track.timeline} grid and the model was trained on a {trained} one, so a step is "
-            f"another time. Synchronize it with {option}."
+            f"another time. Synchronize it with {required_option}."
         )
     track_rate_hz = tracks.rate_hz([track]) if trained == "uniform" else 0.0
     if track_rate_hz and rate_hz and abs(track_rate_hz - rate_hz) > 0.01 * rate_hz:
         raise TacpipeError(
             f"{track.name} has {track_rate_hz:g} rows a second and the model was trained at {rate_hz:g}. "
-            f"Synchronize it with {option}."
+            f"Synchronize it with {required_option}."
         )

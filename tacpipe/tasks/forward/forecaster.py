@@ -97,7 +97,7 @@ class Forecaster:
 
     @property
     def pose(self) -> Pose:
-        """The arm columns that it was trained on; `DEFAULT_POSE` if its configuration does not name them."""
+        """The arm columns that it was trained on; empty without an arm, `DEFAULT_POSE` if the model stores none."""
         stored_pose = self.config["inputs"].get("pose")
         return (
             DEFAULT_POSE
@@ -177,7 +177,7 @@ class Forecaster:
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: OpenedChain | None = None) -> Self:
-        """Return the forecaster in a model's files. Raises `TacpipeError` if they belong to another task.
+        """Return the forecaster in a model's files. Raises `TacpipeError` if they belong to another task or do not fit.
 
         ``chain`` are the stages of the model's chain, from its manifest; without them `predict` cannot check that
         recordings went through the same.
@@ -192,7 +192,7 @@ class Forecaster:
         codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else codecs.load(files)
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         shrinkage = tensors.pop(SHRINKAGE, None)
-        model = model_files.filled(lambda: networks.build(params, codec), tensors)
+        model = model_files.build_with_weights(lambda: networks.build(params, codec), tensors)
         with model_files.validated("the model"):
             model = model if shrinkage is None else Shrunk(model, shrinkage)
             baseline_arrays = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
@@ -207,7 +207,7 @@ class Forecaster:
         return forecaster
 
     def _check_parts(self) -> None:
-        """Predict a window of zeros, to raise an error if parts do not match."""
+        """Predict a window of zeros. Raises `ValueError` if parts do not match."""
         fits = {
             "the context": self.context == self.config["context"] > 0,
             "the horizon": self.horizon == self.config["horizon"] > 0,
@@ -231,9 +231,12 @@ class Forecaster:
                 raise ValueError("the baselines predict another number of steps or channels")
 
     def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
-        """Return predicted counts above rest from arrays; see `prediction.ForwardModel.predict`."""
-        window = np.asarray(window)
-        single = window.ndim == 2
+        """Return predicted counts above rest from arrays; see `prediction.ForwardModel.predict`.
+
+        Arrays without the axis of windows are one window. Raises `TacpipeError` if shapes or values do not fit the
+        model.
+        """
+        single = np.ndim(window) == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         predicted = self._predict_arrays(touch, arm, finger)
@@ -244,10 +247,14 @@ class Forecaster:
         return quantiles_of(self.quantiles, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
-        """Return quantiles of counts above rest from arrays; see `prediction.ForwardModel.predict`."""
+        """Return quantiles of counts above rest from arrays; see `prediction.ForwardModel.predict`.
+
+        Arrays without the axis of windows are one window. Raises `TacpipeError` if shapes or values do not fit the
+        model, or it lacks a quantile of ``percents``.
+        """
         _, at = self.quantiles_of(percents)
-        window = np.asarray(window)
-        single = window.ndim == 2
+
+        single = np.ndim(window) == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         ahead = self._predict_arrays(touch, arm, finger)
@@ -280,7 +287,7 @@ class Forecaster:
         return self.decode_counts(self.features(windows), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
-        """Raise an error for windows (window, context, channel) whose levels are far from rest.
+        """Raise `TacpipeError` for windows (window, context, channel) whose levels are far from rest.
 
         See `ForwardModel.predict`.
         """
@@ -318,7 +325,10 @@ class Forecaster:
         return moved
 
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
-        """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32."""
+        """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32.
+
+        Raises `TacpipeError` if a shape is not what the model reads, or a value is not finite or not an orientation.
+        """
         channels, posed, derived = len(self.codec.channels), len(self.pose.columns), len(self.derived_columns)
         for name, array, rows, before, widths in (
             ("window", window, self.context, channels, (channels + posed + derived + 1, channels + posed)),
@@ -352,11 +362,12 @@ class Forecaster:
 
     def _arm(self, rows: AnyFloats, has_velocities: bool) -> AnyFloats:
         """Return the arm's rows (row, 13) with velocities, and quaternions with the sign used in training."""
-        rows = np.hstack([rows[:, :3], make_continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
+        position, quaternions = rows[:, :3], make_continuous(rows[:, 3:POSE].astype(np.float64))
+        velocity = rows[:, POSE:]
         if not has_velocities:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
-            rows = np.hstack([rows, kinematics.difference_velocity(t_ns, rows[:, :3], rows[:, 3:])])
-        return tracks.align_quaternions(rows, self.orientation)
+            velocity = np.hstack([velocity, kinematics.difference_velocity(t_ns, position, quaternions)])
+        return tracks.align_quaternions(np.hstack([position, quaternions, velocity]), self.orientation)
 
 
 def _pad_pose(rows: AnyFloats, columns: int) -> AnyFloats:

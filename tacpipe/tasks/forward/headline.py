@@ -53,10 +53,10 @@ RECORDINGS, OBJECTS = "recordings", "objects"  # resampling units of the confide
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
 
 
-def legitimate(predictor: str) -> bool:
+def is_baseline(predictor: str) -> bool:
     """Return whether a predictor is a baseline, i.e. neither a variant of the model nor a predictor that uses its codec.
 
-    >>> [legitimate(name) for name in ("ridge", "persistence", "model_anchored", "codec", "codec_persistence")]
+    >>> [is_baseline(name) for name in ("ridge", "persistence", "model_anchored", "codec", "codec_persistence")]
     [True, True, False, False, False]
     """
     return not predictor.startswith((MODEL, "codec"))
@@ -249,9 +249,9 @@ class Parts:
     def squared_skill(self) -> AnyFloats:
         """Mean over steps (...) of 1 minus the ratio of squared errors, both pooled over recordings, to persistence."""
         ratio = intervals.skill(self.squared, self.still_squared)
-        errs = ~np.isnan(ratio)
-        mean = np.where(errs, ratio, 0).sum(axis=-1) / np.maximum(errs.sum(axis=-1), 1)
-        return np.where(errs.any(axis=-1), mean, np.nan)
+        has_errors = ~np.isnan(ratio)
+        mean = np.where(has_errors, ratio, 0).sum(axis=-1) / np.maximum(has_errors.sum(axis=-1), 1)
+        return np.where(has_errors.any(axis=-1), mean, np.nan)
 
 
 def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
@@ -274,12 +274,13 @@ def headline(
     unit: str = COUNTS,
     objects: Mapping[str, str] | None = None,
 ) -> Headline | None:
-    """Compare a method with its baselines on known objects, unseen objects, or all.
+    """Compare a method with its baselines on known objects (``part`` True), unseen objects (False), or all (None).
 
     ``model`` and ``baselines`` contain the `sums` by seed and recording, and ``unit`` is the unit of the mean absolute
-    errors. If ``objects`` (object by recording) is passed, the interval is over objects.
+    errors. If ``objects`` (object by recording) is passed, the interval is over objects. None if nothing can be
+    compared.
     """
-    compared = {name: sums_of_baseline for name, sums_of_baseline in baselines.items() if legitimate(name)}
+    compared = {name: sums_of_baseline for name, sums_of_baseline in baselines.items() if is_baseline(name)}
     cluster = OBJECTS if objects else RECORDINGS
     return pairing.headline(
         TASK, method, measure(steps, unit, cluster), model, compared, part=PARTS[part], clusters=objects, runs=runs

@@ -319,7 +319,7 @@ def _error_sums_by_step(trials: Sequence[Trial], predictor: str, attribute: str)
 def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
     """Return skill with intervals over clusters by step and over all steps, from sums (recording, step).
 
-    Undefined values are omitted.
+    ``clusters`` (recording,) are the units that are resampled. Undefined values are omitted.
     """
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
     return _intervals_by_step(intervals.skill_interval(wide[0], wide[1], clusters))

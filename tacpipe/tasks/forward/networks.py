@@ -142,7 +142,8 @@ def rows_of_tracks(
 ) -> Rows:
     """Return the concatenated rows of all tracks, and the windows at ``starts``, which are row numbers within each track.
 
-    The rows are stored in files of ``mapped``, or in memory if it is None. Raises `StorageError` if the disk is full.
+    The rows are stored in files of ``mapped``, or in memory if it is None. Raises `StorageError` if the disk is full,
+    and `TacpipeError` for unknown ``actions``.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
@@ -160,7 +161,7 @@ def rows_of_tracks(
         return torch.from_numpy(values).to(device)
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
-    begins = [start + offset for start, offset in zip(starts, offsets, strict=False)]
+    absolute_starts = [start + offset for start, offset in zip(starts, offsets, strict=False)]
     touch = stack_parts([track.latent for track in tracks], features)
     arm = stack_parts([track.arm for track in tracks], (windows_of.ARM,))
     finger = stack_parts([track.finger for track in tracks], ())
@@ -173,7 +174,7 @@ def rows_of_tracks(
             ],
             (windows_of.ARM - windows_of.POSE,),
         )
-    first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
+    first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *absolute_starts])).to(device)
     return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped, plan_velocity)
 
 
@@ -211,7 +212,10 @@ def build(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
 
 
 def _member(params: ForwardModelParams, codec: codecs.Codec) -> nn.Module:
-    """Return one network that fits its own scales; wraps a plain network in scales."""
+    """Return one network that fits its own scales; wraps a plain network in scales.
+
+    Raises `TacpipeError` if the architecture builds anything else.
+    """
     sizes = shape(params, codec)
     network = require_network(params.build(sizes), params.architecture)
     scaling_methods = [name for name in METHODS if hasattr(network, name)]

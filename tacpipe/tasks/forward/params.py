@@ -128,11 +128,7 @@ class Change(ForwardModelParams):
         from tacpipe.models import forecasts
 
         choice: str = self.architecture
-        if (
-            choice == forecasts.AUTO
-            and start is not None
-            and start.architecture in fields.choices(Change, "architecture")
-        ):
+        if choice == forecasts.AUTO and start and start.architecture in fields.choices(Change, "architecture"):
             choice = start.architecture
         architecture = cast(
             "Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolve_architecture(choice, layout)

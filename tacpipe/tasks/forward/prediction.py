@@ -54,7 +54,10 @@ def tables(
 def _collect_predictions(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
 ) -> dict[str, Gathered]:
-    """Return the predictions of each recording by name, computed in batches of windows. ``steps`` are counted from 1."""
+    """Return the predictions of each recording by name, computed in batches of windows. ``steps`` are counted from 1.
+
+    Raises the errors of `predict`.
+    """
     check_steps(steps, forecaster.horizon)
     level_indices = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
@@ -91,7 +94,10 @@ def check_steps(steps: Sequence[int], horizon: int) -> None:
 
 
 def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
-    """Return the windows of a dataset's only recording as `Forecaster.predict` reads them."""
+    """Return the windows of a dataset's only recording as `Forecaster.predict` reads them.
+
+    Raises `TacpipeError` if the recording does not fit the model.
+    """
     check_codec(forecaster.codec_files, recordings.files)
     (shard,) = recordings.recordings.values()
     track = forecaster.track(shard)

@@ -118,8 +118,7 @@ class _Predictions(Mapping[str, Prediction]):
         yield "context_mean", Prediction(None, _repeat_over_steps(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
             moved = motion(forecast.windows)[0].transpose(0, 1).numpy()
-            past = past.astype(np.float32)
-            for name, counts in forecaster.baselines.forecasts(past, moved):
+            for name, counts in forecaster.baselines.forecasts(past.astype(np.float32), moved):
                 yield name, Prediction(None, counts)
 
 
@@ -137,7 +136,7 @@ class _Items(ItemsView[str, Prediction]):
 def _model_predictions(
     forecaster: Forecaster, track: Track, forecast: WindowForecast
 ) -> Iterator[tuple[str, Prediction]]:
-    """Yield the predictions of the model and of persistence."""
+    """Yield names and predictions of the model, of persistence, and of the anchored model if the codec loses detail."""
     codec, horizon = forecaster.codec, forecaster.horizon
     last, last_feature = track.tactile[forecast.now], track.latent[forecast.now]
     unchanged = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
@@ -150,7 +149,7 @@ def _model_predictions(
 def _codec_predictions(
     forecaster: Forecaster, track: Track, forecast: WindowForecast
 ) -> Iterator[tuple[str, Prediction]]:
-    """Yield the codec's reconstruction of the true future features, whose error is that of the codec."""
+    """Yield names and reconstructions of the true future features, whose errors are those of the codec; none if raw."""
     codec = forecaster.codec
     if codec.kind == "raw":
         return

@@ -120,7 +120,10 @@ class ResidualQuantiles:
 
 
 def _train_network(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, passes: int) -> nn.Sequential:
-    """Return the network trained to minimise the pinball loss on ``errors`` (value, step), in units of the channel."""
+    """Return the network trained to minimise the pinball loss on ``errors`` (value, step), in units of the channel.
+
+    ``read`` (value, feature) are its inputs.
+    """
     steps, middle = errors.shape[1], len(levels) // 2
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -128,16 +131,20 @@ def _train_network(read: Float32s, errors: Float32s, levels: AnyFloats, seed: in
         network = nn.Sequential(nn.Linear(read.shape[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN), nn.SiLU(), last)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        x, y, p = torch.from_numpy(read), torch.from_numpy(errors), torch.tensor(levels, dtype=torch.float32)
+        inputs, targets, level_tensor = (
+            torch.from_numpy(read),
+            torch.from_numpy(errors),
+            torch.tensor(levels, dtype=torch.float32),
+        )
         optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=passes + 1)
         for _ in range(passes):
-            rows = torch.randint(len(x), (BATCH,))
-            quantiles = _ordered_tensor(network(x[rows]).view(BATCH, steps, len(levels)), middle)
-            above = y[rows][..., None] - quantiles
-            lost: torch.Tensor = pinball(above, p, torch.maximum).mean()
+            rows = torch.randint(len(inputs), (BATCH,))
+            quantiles = _ordered_tensor(network(inputs[rows]).view(BATCH, steps, len(levels)), middle)
+            above = targets[rows][..., None] - quantiles
+            loss: torch.Tensor = pinball(above, level_tensor, torch.maximum).mean()
             optimiser.zero_grad()
-            lost.backward()  # type: ignore[no-untyped-call]
+            loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             schedule.step()
     return network
@@ -205,16 +212,11 @@ def error_features(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: An
     speed = np.abs(arm[..., POSE:])
     moved, planned = speed[:, :context], speed[:, context:]
     repeats = np.cumprod(np.asarray(repeated.all(axis=2))[:, ::-1], axis=1).sum(axis=1)
-    shared = [
-        np.log1p(level.std(axis=1).mean(axis=1) * 100),
-        repeats,
-        *(
-            np.log1p(part[..., axes].max(axis=(1, 2), initial=0) * unit)
-            for part in (moved, planned)
-            for axes, unit in ((slice(0, 3), 100), (slice(3, 6), 10))
-        ),
-        np.log1p(np.abs(finger[:, -1] - finger[:, 0]) * 1000),
-    ]
+    shared = [np.log1p(level.std(axis=1).mean(axis=1) * 100), repeats]
+    for part in (moved, planned):
+        shared.append(np.log1p(part[..., :3].max(axis=(1, 2), initial=0) * 100))
+        shared.append(np.log1p(part[..., 3:].max(axis=(1, 2), initial=0) * 10))
+    shared.append(np.log1p(np.abs(finger[:, -1] - finger[:, 0]) * 1000))
     by_window = np.repeat(np.stack(shared, axis=-1)[:, None], channels, axis=1)
     return np.concatenate([np.stack(by_channel, axis=-1), by_window], axis=-1, dtype=np.float32)
 
@@ -246,10 +248,10 @@ class ForecastQuantiles:
         """
         quantiles = self.errors.predict(read)  # (window, channel, step, level)
         middle, unit = len(self.percents) // 2, self.errors.unit[None]
-        for at in range(len(self.percents)):
-            if at != middle:
-                outwards = unit * self.moved[at].astype(np.float32)
-                quantiles[..., at] += outwards if at > middle else -outwards
+        for index in range(len(self.percents)):
+            if index != middle:
+                outwards = unit * self.moved[index].astype(np.float32)
+                quantiles[..., index] += outwards if index > middle else -outwards
         np.maximum.accumulate(quantiles[..., middle:], axis=-1, out=quantiles[..., middle:])
         down = quantiles[..., : middle + 1][..., ::-1]
         np.minimum.accumulate(down, axis=-1, out=down)
@@ -286,7 +288,10 @@ class ForecastQuantiles:
 
     @classmethod
     def load(cls, content: bytes, channels: int, horizon: int) -> Self:
-        """Load the output of `to_bytes`. Raises `TacpipeError` for any other file, and `ValueError` if shapes do not fit."""
+        """Load the output of `to_bytes` for a model of ``channels`` and ``horizon``.
+
+        Raises `TacpipeError` for any other file, and `ValueError` if shapes do not match.
+        """
         arrays = model_files.arrays(content, FILE)
         quantiles = cls(
             ResidualQuantiles.from_tensors(tensors_under(ERRORS, arrays)),
@@ -326,19 +331,23 @@ def window_features(
 
     Ignores the plan for a model trained without plans or with wrong ones.
     """
-    windows = windows if actions == "planned" else without_plan(windows)
-    arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
+    read = windows if actions == "planned" else without_plan(windows)
+    arm, finger = read.arm.transpose(0, 1).numpy(), read.finger.T.numpy()
     return error_features(past, ahead, arm, finger, scale)
 
 
 def _outward_shifts(
     errors: ResidualQuantiles, predicted: Float32s, calibration: WindowErrors, promised: bool
 ) -> AnyFloats:
-    """Return each quantile's outward shift (level, step) in units of the error."""
+    """Return each quantile's outward shift (level, step) in units of the error.
+
+    ``predicted`` (window, channel, step, level) are the quantiles before the shift; ``promised`` is explained in
+    `ForecastQuantiles.fit`.
+    """
     levels, steps = errors.levels, errors.unit.shape[1]
     middle, channels = len(levels) // 2, errors.unit.shape[0]
     groups = np.repeat(calibration.recordings, channels)
-    moved = np.zeros((len(levels), steps))
+    shifts = np.zeros((len(levels), steps))
     for step in range(steps):
         beyond = (calibration.errors[:, :, step, None] - predicted[:, :, step]) / errors.unit[None, :, step, None]
         for low in range(middle):
@@ -346,11 +355,11 @@ def _outward_shifts(
             sides = {low: -beyond[..., low].ravel(), high: beyond[..., high].ravel()}
             if promised:
                 larger = np.maximum(*sides.values())
-                moved[[low, high], step] = promised_quantile(larger, groups, 2 * level - 1, "recordings")
+                shifts[[low, high], step] = promised_quantile(larger, groups, 2 * level - 1, "recordings")
             else:
-                for at, scores in sides.items():
-                    moved[at, step] = conformal_quantile(scores, groups, level)
-    return moved
+                for side, scores in sides.items():
+                    shifts[side, step] = conformal_quantile(scores, groups, level)
+    return shifts
 
 
 def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:

@@ -109,12 +109,10 @@ class BySituation:
 
     def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
         """Add one predictor's errors on these windows."""
-        before = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
+        sums = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
         for situation in np.unique(situations):
             chosen = situations == situation
-            before[situation] += regression.absolute_error_sums(predicted.count[chosen], truth.count[chosen]).sum(
-                axis=1
-            )
+            sums[situation] += regression.absolute_error_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
 
     def summary(self) -> dict[str, SituationMeasures]:
         """Return windows, recordings, mean absolute errors by predictor and step, and the model's skill, by situation.
@@ -122,12 +120,13 @@ class BySituation:
         Skill is 1 minus the geometric mean over recordings of the mean absolute error relative to persistence's, by
         step and over all steps, with an interval over recordings.
         """
-        return {name: self._measures(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
+        return {name: self._measures(index) for index, name in enumerate(SITUATIONS) if self._recordings(index)}
 
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
     def _measures(self, at: int) -> SituationMeasures:
+        """Return the measures of the situation with the index ``at``."""
         recordings = self._recordings(at)
         count = sum(int(self.windows[name][at]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
@@ -137,14 +136,10 @@ class BySituation:
             for sums in (self._sums(self.absolute, recordings, name, at) for name in (MODEL, BASELINE))
         )
         interval = intervals.geometric_skill_interval(model, persistence)
-        skill = {
-            step: {
-                part: _round(value)
-                for part in ("mean", "low", "high")
-                if math.isfinite(value := getattr(interval, part)[index])
-            }
-            for index, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"])
-        }
+        skill: dict[str, dict[str, float]] = {}
+        for index, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"]):
+            ends = {part: getattr(interval, part)[index] for part in ("mean", "low", "high")}
+            skill[step] = {part: _round(value) for part, value in ends.items() if math.isfinite(value)}
         return {
             "windows": count,
             "recordings": len(recordings),

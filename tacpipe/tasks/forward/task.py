@@ -97,29 +97,29 @@ TRIALS = 30
 def demo(output: Path) -> Demo:
     """Return the demo's commands from simulation to results, which write to ``output``."""
     names = ("recordings", "synced", "segments", "split", "latents", "model", "results", "paper-model", "paper-results")
-    place = {name: str(output / name) for name in names}
-    split = ["--split", place["split"]]
+    paths = {name: str(output / name) for name in names}
+    split = ["--split", paths["split"]]
     paper = ["--preset", "paper", "--epochs", "6", "--batch", "128", "--stride", "3"]  # a tenth of the paper's schedule
     commands = [
-        ["simulate", "forward", "--trials", str(TRIALS), "-o", place["recordings"]],
+        ["simulate", "forward", "--trials", str(TRIALS), "-o", paths["recordings"]],
         *chain(output),
-        ["compress", "pca", place["segments"], *split, "-o", place["latents"]],
-        ["train", "forward", place["latents"], *split, "-o", place["paper-model"], *paper],
-        ["evaluate", place["paper-model"], place["latents"], *split, "-o", place["paper-results"]],
+        ["compress", "pca", paths["segments"], *split, "-o", paths["latents"]],
+        ["train", "forward", paths["latents"], *split, "-o", paths["paper-model"], *paper],
+        ["evaluate", paths["paper-model"], paths["latents"], *split, "-o", paths["paper-results"]],
     ]
-    shortened = [f"{place['model']} (6 of 16 epochs)", f"{place['paper-model']} (6 of 50 epochs)"]
-    results = [place["results"], place["paper-results"]]
+    shortened = [f"{paths['model']} (6 of 16 epochs)", f"{paths['paper-model']} (6 of 50 epochs)"]
+    results = [paths["results"], paths["paper-results"]]
     return Demo(commands, results, recorded=chain(output), shortened=shortened)
 
 
 def chain(output: Path) -> list[list[str]]:
     """Return the commands from the folder ``recordings`` in ``output`` to the results of the default model."""
-    place = {name: str(output / name) for name in ("recordings", "synced", "segments", "split", "model", "results")}
-    split = ["--split", place["split"]]
+    paths = {name: str(output / name) for name in ("recordings", "synced", "segments", "split", "model", "results")}
+    split = ["--split", paths["split"]]
     return [
-        ["synchronize", place["recordings"], "-o", place["synced"]],
-        ["segment", "contacts", place["synced"], "-o", place["segments"]],
-        ["split", place["segments"], "-o", place["split"], "--scheme", "random"],
-        ["train", "forward", place["segments"], *split, "-o", place["model"], "--epochs", "6", "--stride", "2"],
-        ["evaluate", place["model"], place["segments"], *split, "-o", place["results"]],
+        ["synchronize", paths["recordings"], "-o", paths["synced"]],
+        ["segment", "contacts", paths["synced"], "-o", paths["segments"]],
+        ["split", paths["segments"], "-o", paths["split"], "--scheme", "random"],
+        ["train", "forward", paths["segments"], *split, "-o", paths["model"], "--epochs", "6", "--stride", "2"],
+        ["evaluate", paths["model"], paths["segments"], *split, "-o", paths["results"]],
     ]

@@ -143,7 +143,7 @@ class Track:
     def rows_between(self, first: int, last: int) -> Track:
         """Return the rows from ``first`` to ``last``, exclusive."""
 
-        def part_of(values: AnyFloats | Levels) -> AnyFloats | Levels:
+        def slice_rows(values: AnyFloats | Levels) -> AnyFloats | Levels:
             return values.rows_between(first, last) if isinstance(values, Levels) else values[first:last]
 
         selected = {
@@ -151,7 +151,7 @@ class Track:
         }
         if self.plan_velocity is not None:
             selected["plan_velocity"] = self.plan_velocity[first:last]
-        return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **selected)
+        return replace(self, latent=slice_rows(self.latent), tactile=slice_rows(self.tactile), **selected)
 
     def planned_arm(self, rows: Int64s) -> AnyFloats:
         """Return the arm at ``rows`` (…) as a plan contains it, (…, 13), with velocities from `plan_velocity`."""
@@ -332,7 +332,10 @@ def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloat
 
 
 def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
-    """Return the arm's position (time, 3) in m, or the origin without an arm."""
+    """Return the arm's position (time, 3) in m, or the origin without an arm.
+
+    Raises `TacpipeError` if a column is absent.
+    """
     if not pose.position:
         return np.zeros((table.num_rows, 3))
     position = inputs(table, pose.position)
@@ -372,7 +375,10 @@ def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, .
     """Return the columns of the arm's joint angles and joint speeds, or empty tuples if it has none."""
     if pose == poses.DEFAULT_POSE:
         numbers = range(1, JOINTS + 1)
-        names = tuple(f"robot_joint{n}_rad" for n in numbers), tuple(f"robot_joint{n}_velocity_rad_s" for n in numbers)
+        names = (
+            tuple(f"robot_joint{number}_rad" for number in numbers),
+            tuple(f"robot_joint{number}_velocity_rad_s" for number in numbers),
+        )
         return names if set(names[0] + names[1]) <= set(schema.names) else ((), ())
     if not pose.position:
         return (), ()

@@ -110,7 +110,7 @@ def train(
         if not len(windows.starts):
             raise tracks.no_window(f"The {role} recordings contain", dataset, params.context, params.horizon)
     _check_channels(codec, parts[0], mapped)
-    build = partial(_built, params, codec, training_rows, start, device)
+    build = partial(_build_initial, params, codec, training_rows, start, device)
     schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)
     trained = loop.train(
         build, loop.WindowTraining(training_rows.part, validation_rows.part, params.batch), schedule, workspace
@@ -157,10 +157,13 @@ def train(
     }
 
 
-def _built(
+def _build_initial(
     params: Params, codec: codecs.Codec, training_rows: Rows, start: Forecaster | None, device: str
 ) -> nn.Module:
-    """Return the initial network, with scales fitted on some training windows, or with scales and weights of ``start``."""
+    """Return the initial network, with scales fitted on some training windows, or with scales and weights of ``start``.
+
+    Raises `TacpipeError` if the architecture cannot predict these windows or ``start`` has other weights.
+    """
     model = networks.build(params, codec).to(device)
     if len(training_rows.starts):
         sample = training_rows.pick(training_rows.evenly_spread(CALIBRATED))
@@ -173,7 +176,9 @@ def _built(
 
 
 @torch.no_grad()
-def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, watched: Rows) -> dict[str, Tensor]:
+def _shrinkage(
+    weights: dict[str, Tensor], params: Params, codec: codecs.Codec, validation_rows: Rows
+) -> dict[str, Tensor]:
     """Return a tensor with each step's weight of the forecast, fitted on validation windows.
 
     The result is empty for a model that forecasts levels.
@@ -182,17 +187,17 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     if not model.change_only:
         return {}
     model.load_state_dict(weights)
-    starts = watched.evenly_spread(SHRINKING)
-    windows, ahead = watched.pick(starts)
+    starts = validation_rows.evenly_spread(SHRINKING)
+    windows, ahead = validation_rows.pick(starts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(params.seed)  # plans may be shuffled
-        windows = ForecastWindows(*(part.cpu() for part in with_actions(windows, watched.actions)))
+        windows = ForecastWindows(*(part.cpu() for part in with_actions(windows, validation_rows.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
-    return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
+    return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, validation_rows.recording_of(starts))}
 
 
 def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> ModelInputs:
-    """Return the columns that a model reads, for its configuration."""
+    """Return the columns that a model reads and what they mean, for its configuration."""
     inputs: ModelInputs = {
         "tactile": list(codec.channels),
         "layout": [dict(channel) for channel in codec.layout],
@@ -233,7 +238,7 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
 
 
 def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:
-    """Raise an error if the recordings' latents come from another codec than the model's."""
+    """Raise `TacpipeError` if the recordings' latents come from another codec than the model's."""
     if codecs.TENSORS in model and codecs.TENSORS in recordings and model[codecs.TENSORS] != recordings[codecs.TENSORS]:
         kind = json.loads(model[codecs.DESCRIPTION])["kind"]
         raise TacpipeError(
@@ -270,7 +275,7 @@ def _linear(part: Rows) -> WindowArrays:
 
 
 def _check_channels(codec: codecs.Codec, part: Sequence[Track], mapped: MappedArrays) -> None:
-    """Raise an error if no channel of the training recordings ever changes, because there is nothing to predict."""
+    """Raise `TacpipeError` if no channel of the training recordings ever changes, because there is nothing to predict."""
     if any(track.usable.any() for track in part) and not any(
         track.tactile[usable].any() for track, usable in _usable(part, mapped)
     ):
@@ -281,20 +286,25 @@ def _check_channels(codec: codecs.Codec, part: Sequence[Track], mapped: MappedAr
 
 
 def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
-    """Return half of each feature's range and each channel's standard deviation over usable training rows."""
+    """Return half of each feature's range and each channel's standard deviation over usable training rows.
+
+    Raises `TacpipeError` if there is no usable row.
+    """
     ranges = [scaling.fit(track.latent[usable]) for track, usable in _usable(part, mapped)]
     if not ranges:
         scaling.fit(part[0].latent[:0])  # raises an error that explains what to do
     total: AnyFloats = np.zeros(0)
     count = 0
     for track, usable in _usable(part, mapped):
-        total, count = _add_rows(total, track.tactile[usable]), count + len(usable)
+        total = _add_rows(total, track.tactile[usable])
+        count += len(usable)
     mean = total / count
     squares: AnyFloats = np.zeros(0)
     for track, usable in _usable(part, mapped):
         squares = _add_rows(squares, (track.tactile[usable] - mean) ** 2)
     spread = np.sqrt(squares / count)
-    low, high = np.min([track.low for track in ranges], axis=0), np.max([track.high for track in ranges], axis=0)
+    low = np.min([block_range.low for block_range in ranges], axis=0)
+    high = np.max([block_range.high for block_range in ranges], axis=0)
     return {
         "feature_half": scaling.MinMax(low, high).half.tolist(),
         "channel_count": np.where(spread > 0, spread, 1.0).tolist(),

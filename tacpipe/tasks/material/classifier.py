@@ -406,7 +406,9 @@ class StoredClassifier:
         for name in self.layouts:
             shape = AutoencoderShape(**self.config["shapes"][name])
             weights = tensors_under(f"{name}.", tensors)
-            network = model_files.filled(functools.partial(estimators.build_network, params, shape), weights)
+            network = model_files.build_with_weights(
+                functools.partial(estimators.build_network, params, shape), weights
+            )
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers

@@ -140,9 +140,9 @@ def bin_edges(values: AnyFloats, weights: AnyFloats) -> Floats:
     total = np.cumsum(mass)
     targets = np.linspace(0, 100, BINS + 1)[1:-1] / 100 * total[-1]
     last = len(ordered) - 1
-    places = np.minimum(np.searchsorted(total, targets), last)
-    between = (ordered[places] + ordered[np.minimum(places + 1, last)]) / 2
-    edges = np.unique(np.where(total[places] - targets > np.finfo(np.float64).eps, ordered[places], between))
+    crossings = np.minimum(np.searchsorted(total, targets), last)
+    between = (ordered[crossings] + ordered[np.minimum(crossings + 1, last)]) / 2
+    edges = np.unique(np.where(total[crossings] - targets > np.finfo(np.float64).eps, ordered[crossings], between))
     return np.asarray(np.minimum(edges, np.finfo(np.float64).max))
 
 

@@ -55,12 +55,13 @@ def stable_minutes(tracks: Sequence[ScoredTrack]) -> float:
 
 
 def false_alarms(track: ScoredTrack, level: float, horizon_ns: int) -> int:
-    """Return the number of false alarms of a recording."""
+    """Return the number of false alarms of a recording, each of which lasts for the horizon."""
     times = track.t_ns[(track.scores >= level) & (track.states == STABLE)]
     count, until_ns = 0, np.iinfo(np.int64).min
     for t_ns in times.tolist():
         if t_ns > until_ns:
-            count, until_ns = count + 1, t_ns + horizon_ns
+            count += 1
+            until_ns = t_ns + horizon_ns
     return count
 
 
@@ -159,7 +160,10 @@ class EventScore:
 
 
 def score_events(track: ScoredTrack, level: float, horizon_ns: int) -> list[EventScore]:
-    """Return how an alarm did on each slip of a recording that has rows before it."""
+    """Return how an alarm did on each slip of a recording that has rows before it.
+
+    An alarm that lasts from before a slip into it has no delay.
+    """
     results = []
     start_ns = int(track.t_ns[0]) - round(float(track.since_s[0]) * 1e9) if len(track.t_ns) else 0
     on = track.scores >= level
@@ -170,7 +174,9 @@ def score_events(track: ScoredTrack, level: float, horizon_ns: int) -> list[Even
             continue
         early, late = track.t_ns[before & on], track.t_ns[during & on]
         lead = (begin - int(early[0])) / 1e6 if len(early) else math.nan
-        delay = 0.0 if len(early) and on[before][-1] else (int(late[0]) - begin) / 1e6 if len(late) else math.nan
+        delay = (int(late[0]) - begin) / 1e6 if len(late) else math.nan
+        if on[before][-1]:
+            delay = 0.0
         first = [int(times[0]) for times in (early, late) if len(times)]
         to_end = (end - min(first)) / 1e6 if first else math.nan
         results.append(EventScore(track.name, track.object, (begin - start_ns) / 1e9, lead, delay, to_end))

@@ -105,11 +105,9 @@ class EvaluatedSlips:
                 if track.name not in parts or track.object not in part.known_objects:
                     parts[track.name] = (part, index)
         tracks = [part.tracks[index] for part, index in parts.values()]
-        since_s, slips = (
-            np.concatenate([np.zeros(0), *values])
-            for values in ([track.since_s for track in tracks], [track.states > STABLE for track in tracks])
-        )
-        weights = match_time(since_s, slips > 0)
+        since_s = np.concatenate([np.zeros(0), *(track.since_s for track in tracks)])
+        slips = np.concatenate([np.zeros(0, bool), *(track.states > STABLE for track in tracks)])
+        weights = match_time(since_s, slips)
         ends = np.cumsum([len(track.t_ns) for track in tracks])[:-1]
         matched = [replace(track, weights=own) for track, own in zip(tracks, np.split(weights, ends), strict=True)]
 
@@ -201,33 +199,33 @@ class EvaluatedSlips:
 
     @classmethod
     def from_result(cls, result: Dataset) -> EvaluatedSlips:
-        """Return the evaluation of a result."""
+        """Return the evaluation that is stored in a result, with its folds matched for time again."""
         table = result.recordings[WINDOWS].table()
         described = model_files.tree(result.files, EVENTS)
         names = table["recording"].to_numpy(zero_copy_only=False)
         predictors = [name.removeprefix("score_") for name in table.column_names if name.startswith("score_")]
         values = {name: table[name].to_numpy() for name in table.column_names if name not in ("recording", "object")}
-        tracks, places = [], []
+        tracks, rows_by_track = [], []
         for name, own in sorted(described.items()):
-            place = np.flatnonzero(names == name)
-            places.append(place)
+            rows = np.flatnonzero(names == name)
+            rows_by_track.append(rows)
             events = np.array(own["slips"], np.int64).reshape(-1, 2)
-            since_s = values["since_s"][place]
+            since_s = values["since_s"][rows]
             tracks.append(
                 ScoredTrack(
                     name,
                     str(own["object"]),
-                    values["t_ns"][place],
-                    values["state"][place].astype(np.int64),
-                    values[f"score_{MODEL}"][place],
+                    values["t_ns"][rows],
+                    values["state"][rows].astype(np.int64),
+                    values[f"score_{MODEL}"][rows],
                     events,
-                    np.ones(len(place)),
+                    np.ones(len(rows)),
                     since_s,
                 )
             )
 
         def column(prefix: str) -> dict[str, tuple[Floats, ...]]:
-            return {name: tuple(values[f"{prefix}_{name}"][place] for place in places) for name in predictors}
+            return {name: tuple(values[f"{prefix}_{name}"][rows] for rows in rows_by_track) for name in predictors}
 
         levels = {name: own["levels"] for name, own in described.items()}
         known = frozenset(model_files.tree(result.files, model_files.CONFIG, {"objects": list})["objects"])
@@ -259,7 +257,10 @@ def brier_measure() -> Measure:
 
 
 def headline_of(method: str, evaluated: EvaluatedSlips) -> headline.Headline | None:
-    """Return the Brier score of the model next to those of its baselines, with the interval over objects."""
+    """Return the Brier score of the model next to those of its baselines, with the interval over objects.
+
+    None if no baseline can be compared.
+    """
     baselines: dict[str, Sums] = {
         name.replace("_", " "): evaluated.sums(name) for name in evaluated.scores if name != MODEL
     }

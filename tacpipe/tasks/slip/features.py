@@ -76,11 +76,11 @@ def finger_features(windows: AnyFloats, layout: FingerLayout) -> Floats:
         features[:, 3:8] = np.stack(
             [speeds[:, -1], recent, mean, speeds.max(axis=1), recent / np.maximum(mean, EPSILON)], axis=1
         )
-        for place, start in ((8, 0), (9, late)):
+        for column, start in ((8, 0), (9, late)):
             moved = last - windows[:, start]
-            features[:, place] = np.sqrt(np.square(moved).mean(axis=1))
-            features[:, place + 2] = _spread(moved, layout)
-            if place == 9:
+            features[:, column] = np.sqrt(np.square(moved).mean(axis=1))
+            features[:, column + 2] = _spread(moved, layout)
+            if column == 9:
                 features[:, 12] = np.abs(moved).max(axis=1) / np.maximum(features[:, 9], EPSILON)
         features[:, len(NAMES) - len(CYCLES) :] = _spectra(levels)
     if len(layout.shear[0]):

@@ -45,12 +45,12 @@ def read_labels(recording: Recording) -> SlipLabels | None:
         )
         events = [(start_ns + round(begin * 1e9), start_ns + round(end * 1e9)) for begin, end in intervals]
         return SlipLabels(np.array(events, np.int64).reshape(-1, 2), contact)
-    found = _columns(recording, COLUMNS)
-    if not found:
+    labels = _columns(recording, COLUMNS)
+    if not labels:
         return None
-    if any((values < 0).any() for _, values in found):
+    if any((values < 0).any() for _, values in labels):
         return None
-    return SlipLabels(merge_events([run_times(t_ns, values > 0) for t_ns, values in found]), contact)
+    return SlipLabels(merge_events([run_times(t_ns, values > 0) for t_ns, values in labels]), contact)
 
 
 def run_times(t_ns: Times, active: Bools) -> Times:
@@ -75,6 +75,7 @@ def merge_events(parts: Sequence[Times]) -> Times:
 
 
 def _contact(recording: Recording) -> tuple[Times, Bools] | None:
+    """Return times (time,) and whether the object is touched (time,), or None if no column states it."""
     columns = _columns(recording, CONTACT)
     if not columns:
         return None

@@ -105,6 +105,7 @@ class WindowScores:
     """All counted windows of several recordings with the scores of one predictor."""
 
     def __init__(self, tracks: Sequence[ScoredTrack]) -> None:
+        """Join the windows of tracks (window,)."""
         self.tracks = list(tracks)
         sizes = [len(track.t_ns) for track in self.tracks]
         self.recording = np.repeat(np.arange(len(sizes)), sizes)
@@ -130,8 +131,8 @@ class WindowScores:
         if name == "within":
             return ((self.states == BEFORE) | stable) & self.has_slip, self.states == BEFORE
         lead_s = float(name.split()[1])
-        near = (self.states == BEFORE) & (np.abs(self.until_s - lead_s) <= LEAD_WIDTH_S)
-        return near | stable, near
+        before = (self.states == BEFORE) & (np.abs(self.until_s - lead_s) <= LEAD_WIDTH_S)
+        return before | stable, before
 
     def area(self, name: str) -> Area:
         """Return the area under the curve of a part, as sums by object.
@@ -160,9 +161,9 @@ class WindowScores:
             rows = counted & (self.recording == number)
             before, earlier = (self.scores[rows & kind] for kind in (positive, ~positive))
             if len(earlier):
-                place = int(self.objects[rows][0])
-                wins[place, place] += _wins(before, earlier, np.full(len(earlier), 1 / len(earlier))).sum()
-                totals[place] += len(before)
+                owner = int(self.objects[rows][0])
+                wins[owner, owner] += _wins(before, earlier, np.full(len(earlier), 1 / len(earlier))).sum()
+                totals[owner] += len(before)
         return Area(wins, totals, None)
 
 
@@ -180,8 +181,8 @@ def _joined(parts: Sequence[AnyFloats | Bools | Int64s]) -> AnyFloats:
 def estimate(value: float, without: AnyFloats, effective: float, *, is_share: bool = False) -> ObjectEstimate:
     """Return a value with its interval from the values without each object (object,); NaN becomes null.
 
-    ``effective`` is the effective number of objects. A share, such as an area, is transformed to log odds, because
-    its distribution is skewed near 0 and 1. There is no interval if no object changes the value.
+    ``effective`` is the effective number of objects. A share, such as an area, is transformed to log odds, because its
+    distribution is skewed near 0 and 1. There is no interval if no object changes the value.
     """
     values, mean = (_log_odds(without), _log_odds(value)) if is_share else (without, np.asarray(value))
     influence = values.mean() - values

@@ -37,6 +37,7 @@ class CausalNetwork(nn.Module):
     """Convolutions over time whose last output depends on the whole window."""
 
     def __init__(self, inputs: int, channels: int, layers: int) -> None:
+        """Create a network of ``layers`` convolutions with ``channels`` each, with random weights."""
         super().__init__()
         widths = [inputs, *[channels] * layers]
         self.layers = nn.ModuleList(
@@ -77,6 +78,10 @@ class WindowWork:
     """Training of the network by weighted cross-entropy; every fifth object is held out."""
 
     def __init__(self, windows: TrainingWindows, batch: int) -> None:
+        """Hold out every fifth group of windows, or none if they have no slip.
+
+        Raises `TacpipeError` if fingers have windows of different lengths.
+        """
         _require_equal_rows(windows.reader)
         self.windows, self.batch = windows, batch
         held_out = windows.groups % HELD_OUT == HELD_OUT - 1
@@ -90,9 +95,9 @@ class WindowWork:
         windows = self.windows
         parts = np.empty((len(chosen), *self.shape), np.float32)
         for number in np.unique(windows.track[chosen]).tolist():
-            places = np.flatnonzero(windows.track[chosen] == number)
-            rows = windows.rows[chosen[places]]
-            parts[places] = stack_windows(windows.reader.windows(windows.tracks[number], rows), windows.reader)
+            positions = np.flatnonzero(windows.track[chosen] == number)
+            rows = windows.rows[chosen[positions]]
+            parts[positions] = stack_windows(windows.reader.windows(windows.tracks[number], rows), windows.reader)
         return torch.from_numpy(parts)
 
     @property
@@ -118,10 +123,11 @@ class WindowWork:
         return {"val_loss": sum(losses) / len(self.held_out)}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
-        """Return the loss as the rank of an epoch."""
+        """Return the loss as the only criterion by which epochs are ranked."""
         return {"": (float(line["val_loss"]),)}
 
     def _loss(self, model: nn.Module, chosen: Indices) -> Tensor:
+        """Return the weighted mean loss of a network on windows with these indices."""
         labels = torch.from_numpy(self.windows.slips[chosen].astype(np.float32))
         weights = torch.from_numpy(self.windows.weights[chosen].astype(np.float32))
         losses = nn.functional.binary_cross_entropy_with_logits(model(self.inputs(chosen)), labels, reduction="none")
@@ -185,7 +191,10 @@ class ConvolutionScorer:
     def load(
         cls, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader
     ) -> ConvolutionScorer:
-        """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another."""
+        """Return the scorer that `arrays` and `describe` wrote. Raises `ValueError` if they do not fit one another.
+
+        Raises `TacpipeError` if fingers have windows of different lengths.
+        """
         _require_equal_rows(reader)
         sizes = {name: int(described[name]) for name in ("inputs", "channels", "layers")}
         inputs = input_count(reader)
@@ -197,6 +206,7 @@ class ConvolutionScorer:
 
 
 def _require_equal_rows(reader: FingerReader) -> None:
+    """Raise `TacpipeError` if fingers have windows of different lengths."""
     rows = {finger.rows for finger in reader.fingers}
     if len(rows) > 1:
         raise TacpipeError(

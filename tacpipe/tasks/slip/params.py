@@ -133,7 +133,10 @@ class ForecastRule(SlipModelParams):
     forward_digest: str = ""  # digest of that model; computed if omitted
 
     def __post_init__(self) -> None:
-        """Compute the digest of the forward model, which is part of the key."""
+        """Compute the digest of the forward model, which is part of the key.
+
+        Raises `UsageError` if ``forward_digest`` states another one.
+        """
         if not self.forward_model:
             return
         from tacpipe.datasets import manifest

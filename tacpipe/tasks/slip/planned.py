@@ -106,12 +106,12 @@ def motion(plan: PosePlan) -> tuple[Times, Floats]:
 
 def _thinned(plan: PosePlan) -> tuple[Times, Floats]:
     """Return times (point,) and positions (point, 3) of a plan without points that follow closely."""
-    retained, last_ns = [], -SMALLEST_STEP_NS
-    for place, t_ns in enumerate((plan.t_ns - plan.t_ns[0]).tolist()):
+    kept, last_ns = [], -SMALLEST_STEP_NS
+    for index, t_ns in enumerate((plan.t_ns - plan.t_ns[0]).tolist()):
         if t_ns - last_ns >= SMALLEST_STEP_NS:
-            retained.append(place)
+            kept.append(index)
             last_ns = t_ns
-    return plan.t_ns[retained], plan.poses[retained, :3]
+    return plan.t_ns[kept], plan.poses[kept, :3]
 
 
 def sample(t_ns: Times, moved: Floats, at_ns: int) -> Floats:
@@ -129,7 +129,7 @@ def sample(t_ns: Times, moved: Floats, at_ns: int) -> Floats:
 
 def planned_features(ahead: AnyFloats) -> Floats:
     """Return the features (window, feature) of planned motion (window, point, channel), as `NAMES_OF_PLAN`."""
-    load, acceleration, speed = (ahead[:, :, place] for place in range(len(CHANNELS)))
+    load, acceleration, speed = (ahead[:, :, index] for index in range(len(CHANNELS)))
     tops = np.where(np.isnan(load), -np.inf, load).argmax(axis=1)
     time_s = np.where(np.isnan(load).all(axis=1), np.nan, tops * (STEP_NS / 1e9))
     loads, accelerations = (_largest(values) for values in (load, acceleration))

@@ -107,6 +107,7 @@ def alarm_table(measured: Mapping[str, Any]) -> Any:
 
 
 def _estimate(estimate: ObjectEstimate) -> str | Cell:
+    """Return a cell with an estimate and its interval below, without the parts that are null."""
     value, low, high = estimate["value"], estimate["low"], estimate["high"]
     if value is None:
         return NONE

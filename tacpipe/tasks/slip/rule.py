@@ -44,19 +44,19 @@ def rise_and_fall(shear: AnyFloats, load: AnyFloats) -> Floats:
 
 def score_forecasts(table: pa.Table) -> Floats:
     """Return the score of each row of a table of forecasts, by the metadata of its columns; 0 without shear."""
-    places: dict[tuple[str, str, int], list[str]] = {}
+    columns: dict[tuple[str, str, int], list[str]] = {}
     for field in table.schema:
         about = field_metadata(field)
         if about.get("quantity") == "prediction" and "axis" in about and "quantile" not in about:
-            places.setdefault((about.get("stream", ""), about["axis"], int(about["step"])), []).append(field.name)
-    steps = sorted({step for _, _, step in places})
+            columns.setdefault((about.get("stream", ""), about["axis"], int(about["step"])), []).append(field.name)
+    steps = sorted({step for _, _, step in columns})
     scores = np.zeros(table.num_rows)
 
     def mean(stream: str, axis: str, step: int) -> Floats:
-        names = places.get((stream, axis, step), [])
+        names = columns.get((stream, axis, step), [])
         return np.asarray(tactile.matrix(table, names).mean(axis=1)) if names else np.zeros(table.num_rows)
 
-    for stream in sorted({stream for stream, _, _ in places}):
+    for stream in sorted({stream for stream, _, _ in columns}):
         shear = np.stack([np.hypot(mean(stream, "x", step), mean(stream, "y", step)) for step in steps], axis=1)
         scores = np.maximum(scores, rise_and_fall(shear, np.abs(mean(stream, "z", steps[0]))))
     return scores

@@ -176,6 +176,7 @@ def _standardise(rows: Floats, means: Floats, deviations: Floats) -> Floats:
 
 
 def _stored_columns(described: Mapping[str, Any], reader: FingerReader) -> tuple[int, ...]:
+    """Return the columns of the features that a scorer reads. Raises `ValueError` if the reader lacks one."""
     columns = tuple(map(int, described["columns"]))
     available = reader.feature_count + 1
     if not all(0 <= column < available for column in columns):
@@ -224,14 +225,14 @@ def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
     """
     names = reader.names
 
-    def places(*words: str) -> tuple[int, ...]:
+    def columns_named(*words: str) -> tuple[int, ...]:
         return tuple(index for index, name in enumerate(names) if name.removeprefix("largest ") in words)
 
     baselines = {
         "time_only": (len(names),),
-        "shear_over_load": places("shear over load", "shear", "level"),
-        "total_change": places("motion"),
-        "planned_motion": places(*(name.removeprefix("largest ") for name in NAMES_OF_PLAN)),
+        "shear_over_load": columns_named("shear over load", "shear", "level"),
+        "total_change": columns_named("motion"),
+        "planned_motion": columns_named(*(name.removeprefix("largest ") for name in NAMES_OF_PLAN)),
     }
     return {name: columns for name, columns in baselines.items() if columns}
 

@@ -103,10 +103,14 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
         "baseline_levels": levels,
         "base_rate": float(f"{np.average(windows.slips, weights=windows.weights):.9g}"),
     }
-    described: dict[str, AnyArray] = {
-        f"{name}.{part}": array for name, baseline in baselines.items() for part, array in baseline.arrays().items()
+    baseline_arrays: dict[str, AnyArray] = {}
+    for name, baseline in baselines.items():
+        baseline_arrays |= {f"{name}.{part}": array for part, array in baseline.arrays().items()}
+    return {
+        model_files.CONFIG: model_files.to_json(config),
+        MODEL: save(scorer.arrays()),
+        BASELINES: save(baseline_arrays),
     }
-    return {model_files.CONFIG: model_files.to_json(config), MODEL: save(scorer.arrays()), BASELINES: save(described)}
 
 
 def labelled_tracks(reader: FingerReader, dataset: Dataset) -> list[GraspTrack]:

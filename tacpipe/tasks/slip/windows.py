@@ -86,7 +86,7 @@ class FingerRows:
 
 
 def measure_rest(t_ns: Times, values: AnyFloats, rest_ns: int) -> tuple[Floats, int] | None:
-    """Return the level at rest (channel,) and the number of its rows, or None until `rest_ns` have passed."""
+    """Return the level at rest (channel,) and the number of its rows, or None until ``rest_ns`` have passed."""
     if not rest_ns:
         return np.zeros(values.shape[1]), 0
     count = int(np.searchsorted(t_ns, t_ns[0] + rest_ns)) if len(t_ns) else 0
@@ -165,8 +165,8 @@ class GraspTrack:
         if self.labels is None or self.labels.contact is None:
             return np.ones(len(self.t_ns), bool)
         times, touched = self.labels.contact
-        places = np.searchsorted(times, self.t_ns, side="right") - 1
-        return np.asarray(touched[np.maximum(places, 0)] & (places >= 0))
+        rows = np.searchsorted(times, self.t_ns, side="right") - 1
+        return np.asarray(touched[np.maximum(rows, 0)] & (rows >= 0))
 
     def states(self, horizon_ns: int, recovery_ns: int) -> Int64s:
         """Return the state of each row (time,): `STABLE`, `BEFORE` or `DURING` a slip, or `UNCOUNTED`.
@@ -377,20 +377,23 @@ def _scale(mean_square: Floats, layout: Sequence[Mapping[str, str]]) -> Floats:
 
 
 def _tactile_tables(recording: Recording, streams: str) -> Iterator[tuple[str, pa.Table]]:
-    """Yield name and table of each tactile stream; those of a synchronized recording by the metadata of its columns."""
+    """Yield name and table of each tactile stream; those of a synchronized recording by the metadata of its columns.
+
+    Raises `TacpipeError` if there is none.
+    """
     from fnmatch import fnmatchcase
 
     patterns = [word.strip() for word in streams.split(",") if word.strip()]
     has_any = False
-    for place in recording.streams:
-        schema = recording.columns(place).schema
+    for stored_stream in recording.streams:
+        schema = recording.columns(stored_stream).schema
         by_stream: dict[str, list[str]] = {}
         for name in tactile.columns(schema, "tactile"):
-            by_stream.setdefault(place or field_metadata(schema.field(name)).get("stream", ""), []).append(name)
+            by_stream.setdefault(stored_stream or field_metadata(schema.field(name)).get("stream", ""), []).append(name)
         for stream, names in by_stream.items():
             if not patterns or any(fnmatchcase(stream, pattern) for pattern in patterns):
                 has_any = True
-                yield stream, recording.table(place, ["t_ns", *names])
+                yield stream, recording.table(stored_stream, ["t_ns", *names])
     if not has_any:
         raise TacpipeError(
             f"{recording.name} has no tactile channel to learn from. Run `tacpipe extract markers` on videos of gels, or "
@@ -466,8 +469,8 @@ def match_time(since_s: Floats, slips: Bools) -> Floats:
     shared = set(bins[slips].tolist()) & set(bins[~slips].tolist())
     in_shared = np.isin(bins, list(shared))
     stable, slipping = int((in_shared & ~slips).sum()), int((in_shared & slips).sum())
-    for place in shared:
-        here = bins == place
+    for shared_bin in shared:
+        here = bins == shared_bin
         weights[here & ~slips] = stable * (here & slips).sum() / slipping / (here & ~slips).sum()
     weights[~in_shared] = 0.0
     return weights
@@ -480,7 +483,7 @@ def shuffle_labels(tracks: Sequence[GraspTrack], seed: int) -> list[GraspTrack]:
     """
     order = np.random.default_rng(seed).permutation(len(tracks))
     shuffled = []
-    for track, donor in zip(tracks, (tracks[place] for place in order), strict=True):
+    for track, donor in zip(tracks, (tracks[number] for number in order), strict=True):
         events = donor.events - donor.start_ns + track.start_ns
         events = events[events[:, 0] < track.t_ns[-1]]
         contact = track.labels.contact if track.labels is not None else None

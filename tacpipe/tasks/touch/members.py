@@ -99,7 +99,7 @@ class TouchWork:
         return {"val_loss": float(self._loss(torch.from_numpy(predicted).to(values), values))}
 
     def ranks(self, line: Line) -> dict[str, tuple[float]]:
-        """Return the validation loss as the rank of an epoch."""
+        """Return the validation loss as the only criterion by which epochs are ranked."""
         return {"": (float(line["val_loss"]),)}
 
     def _loss(self, predicted: Tensor, values: Tensor) -> Tensor:

@@ -333,6 +333,6 @@ class StoredMember:
         if scale.offset.shape != (width,) or scale.scale.shape != (width,):
             raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
         weights = tensors_under("network.", self.tensors)
-        network = model_files.filled(lambda: members.network(params, self.targets), weights)
+        network = model_files.build_with_weights(lambda: members.network(params, self.targets), weights)
         members.check_sizes(params)
         return members.NetworkMember(self.targets, network.to(self.device).eval(), scale, params)

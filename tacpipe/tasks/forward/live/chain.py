@@ -200,8 +200,8 @@ class LiveChain:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
         cameras = live_channels(steps, layouts)
-        layouts = {**layouts, **{name: camera.schema for name, camera in cameras.items()}}
-        layout = InputLayout.for_forecaster(forecaster, stages.synchronize, layouts, master)
+        read_layouts = {**layouts, **{name: camera.schema for name, camera in cameras.items()}}
+        layout = InputLayout.for_forecaster(forecaster, stages.synchronize, read_layouts, master)
         known = cameras if beginning is None else dict.fromkeys(cameras)
         return cls(forecaster, steps, layout, beginning, targets, quantiles, known)
 
@@ -290,12 +290,13 @@ class LiveChain:
         if stream == PLAN:
             self._push_plans(batch)
         elif stream in self._layout.readings and batch.num_rows:
+            samples = batch
             if stream in self._cameras:
                 camera = self._cameras[stream]
                 if camera is None:
                     return
-                batch = camera.push(batch)
-            self._grid.push(stream, *self._layout.samples(stream, batch))
+                samples = camera.push(batch)
+            self._grid.push(stream, *self._layout.samples(stream, samples))
 
     def continue_cameras(self, previous: LiveChain) -> None:
         """Continue the channels of the cameras of an earlier chain of the session, which know the untouched gels."""
@@ -343,7 +344,7 @@ class LiveChain:
         return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
 
     def _forecast(self, row: _Row, *, skipped: bool) -> GridForecast:
-        """Return the forecast of a row, after the rows that determine the rest level."""
+        """Add a row and return its forecast, without values until the rest level is known and the window is full."""
         if self._resting is not None:
             first = self._resting[0] if self._resting else row
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
@@ -383,7 +384,7 @@ class LiveChain:
         )
 
     def _planned_rows(self, t_ns: int) -> tuple[AnyFloats, Cause]:
-        """Return the arm's planned rows (horizon, 13), and the cause if the plan is missing or too short."""
+        """Return the arm's planned rows (horizon, 13), and the cause if the plan is missing or too short, else NONE."""
         now, ahead_ns = self._rolling.arm, t_ns + self._steps_ns()
         if not self.reads_plan:  # a model without plans uses the newest row instead
             return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE

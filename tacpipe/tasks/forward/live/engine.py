@@ -100,6 +100,11 @@ class ForecastEngine(Engine):
         settle_ns: int = SETTLE_NS,
         quantiles: Sequence[int] = (),
     ) -> None:
+        """Create the first chain from the likely schemas of the sensors' streams.
+
+        ``opened`` creates a chain from schemas and an optional earlier beginning, ``alarms`` the alarms of a chain.
+        Without ``steps`` all steps are published.
+        """
         super().__init__(sensors, settle_ns)
         self._open_chain = opened
         self.quantiles = tuple(quantiles)
@@ -126,7 +131,7 @@ class ForecastEngine(Engine):
 
     @property
     def beginning(self) -> Beginning | None:
-        """The state that another process needs to continue this recording."""
+        """The state that another process needs to continue this recording; None before the rest level is known."""
         return self.chain.beginning
 
     def describe(self, model: str) -> ForecastDescription:
@@ -229,6 +234,7 @@ class ForecastEngine(Engine):
                     self.chain.push(name, decoder.columns(batch, offset_ns))
 
     def _message(self, forecast: GridForecast, now_ns: int) -> ForecastMessage:
+        """Return the message with a forecast, or with its cause if the forecast has no values."""
         values, levels = None, None
         if forecast.count is not None and forecast.now is not None:
             published_rows = [step - 1 for step in self.steps]
@@ -271,6 +277,7 @@ class ForecastEngine(Engine):
         return [message]
 
     def _restart(self, cause: str, beginning: Beginning | None) -> None:
+        """Replace the chain by one with the layouts that are known, which continues ``beginning`` if it is not None."""
         self._late += sum(self.chain.late.values())
         layouts = {name: self._first.get(name) or likely_schema(sensor) for name, sensor in self.sensors.items()}
         self.chain = self._open_chain(layouts, beginning)

@@ -50,7 +50,8 @@ class _Offline(NamedTuple):
 def evaluate(model: Model, recordings: Dataset) -> Result:
     """Evaluate recordings of live sessions.
 
-    Raises `UsageError` if one has no stream ``forecast``, or its session ran another model.
+    Raises `UsageError` if one has no stream ``forecast``, or its session ran another model. Errors of a recording begin
+    with its name.
     """
     check(model.digest, recordings)
     forecaster = Forecaster.load(model.files)
@@ -105,6 +106,10 @@ def check(digest: str, recordings: Dataset) -> None:
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
+    """Compare the forecasts that a session published with those of the offline chain and model.
+
+    ``offline`` is the recording after the model's stages; ``steps`` are those whose errors are summed.
+    """
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
     session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
@@ -133,6 +138,7 @@ def _session(
 
 
 def _offline(forecaster: Forecaster, track: Track) -> _Offline:
+    """Return the offline forecasts of a track: the last input row of each window, and the predicted counts."""
     starts = track.starts(forecaster.context, forecaster.horizon)
     batches = list(forecasts(forecaster, track, starts))
     if not batches:
@@ -152,7 +158,7 @@ def _errors(
     predicted: _Offline,
     steps: tuple[int, ...],
 ) -> tuple[int, Sums]:
-    """Return the number of rows that all predictors have, and the sums of their errors over these rows."""
+    """Return the number of rows that all predictors have, and the sums of their errors over these rows by predictor."""
     row_ns, values = session.t_ns, session.values
     if not set(steps) <= set(session.steps) or chain.rest is None or not len(predicted.now):
         return 0, {}
@@ -186,7 +192,7 @@ def _errors(
 
 
 def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
-    """Return how many rows differ within a context after, or one row before, samples that arrived too late."""
+    """Count the rows that differ within a context after, or one row before, samples that arrived too late."""
     period_ns = 1e9 / float(forecaster.config["rate_hz"])
     reach_ns = (forecaster.context + 1) * period_ns
     if not len(late_ns):
@@ -198,7 +204,7 @@ def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
 def _headline(
     forecaster: Forecaster, sessions: Mapping[str, Session], steps: tuple[int, ...], channels: int
 ) -> list[Any]:
-    """Return the comparison of the published forecasts with persistence on the same rows."""
+    """Return the comparison of the published forecasts with persistence on the same rows; empty without such rows."""
     compared = {name: session for name, session in sessions.items() if session.rows}
     if not compared:
         return []

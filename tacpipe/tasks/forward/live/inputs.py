@@ -92,11 +92,10 @@ class InputLayout:
         import pyarrow as pa
 
         signals = {name: layouts[name] for name in sorted(layouts) if name != EVENTS and may_be_signal(layouts[name])}
-        origin = {
-            streams.grid_name(stream, name): (stream, name)
-            for stream, schema in signals.items()
-            for name in streams.channel_names(schema)
-        }
+        origin: dict[str, tuple[str, str]] = {}  # stream and column of each grid column
+        for stream, schema in signals.items():
+            for name in streams.channel_names(schema):
+                origin[streams.grid_name(stream, name)] = (stream, name)
         grid = pa.schema(
             [
                 streams.grid_field(stream, signals[stream].field(name), "hold").with_name(grid_column)
@@ -107,7 +106,8 @@ class InputLayout:
         leader = streams.master("of this rig", synchronize.master or master, signals)
         columns: dict[str, list[str]] = {leader: []}
 
-        def placed(names: Sequence[str]) -> Place | None:
+        def place_columns(names: Sequence[str]) -> Place | None:
+            """Add the columns of one stream to those that are read; return the stream and their indices in it."""
             if not names:
                 return None
             stream = origin[names[0]][0]
@@ -125,19 +125,19 @@ class InputLayout:
         kinds: dict[str, np.dtype[Any]] = {}
         for stream, indices in by_stream.items():
             names = [forecaster.codec.channels[index] for index in indices]
-            place = placed(names)
+            place = place_columns(names)
             assert place is not None
             tactile_of[stream] = (place[1], np.array(indices, np.intp))
             axes[stream] = count_axes(grid, names)
             kind = np.result_type(*(grid.field(name).type.to_pandas_dtype() for name in names))
             kinds[stream] = kind if kind.kind == "f" else np.dtype(np.float64)
         pose = forecaster.pose
-        position, orientation = placed(pose.position), placed(pose.orientation)
+        position, orientation = place_columns(pose.position), place_columns(pose.orientation)
         angles, speeds = tracks.joints(grid, pose)
         has_joints = len(angles) == len(speeds) == tracks.JOINTS
         opening = tracks.opening(grid)
-        joints = (placed(angles), placed(speeds)) if has_joints else (None, None)
-        finger = placed([opening] if opening else [])
+        joints = (place_columns(angles), place_columns(speeds)) if has_joints else (None, None)
+        finger = place_columns([opening] if opening else [])
         readings = {
             stream: _stream_columns(signals[stream], names, synchronize, is_master=stream == leader)
             for stream, names in columns.items()
@@ -170,8 +170,8 @@ class InputLayout:
                 raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
             place = (batch.schema, tuple(names.index(name) for name in ("t_ns", *self.columns[stream])))
             self._places[stream] = place
-        first, *value_columns = place[1]
-        t_ns = _array(batch.column(first)).astype(np.int64, copy=False)
+        time_column, *value_columns = place[1]
+        t_ns = _array(batch.column(time_column)).astype(np.int64, copy=False)
         if isinstance(batch, BatchColumns):
             return t_ns, batch.columns_of(tuple(value_columns))
         values = np.empty((batch.num_rows, len(value_columns)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,19 +32,25 @@ class Equality:
 def equality(
     published_ns: Times, published: Float32s, recomputed_ns: Times, recomputed: Float32s
 ) -> tuple[Equality, Bools]:
-    """Return how rows at times (row,) and values (row, step, channel) compare, and which published rows are equal (row,)."""
-    _, ours, theirs = np.intersect1d(published_ns, recomputed_ns, return_indices=True)
-    sent, given_again = (np.ascontiguousarray(values, np.float32) for values in (published[ours], recomputed[theirs]))
-    same = (sent.view(np.int32) == given_again.view(np.int32)).all(axis=(1, 2)) if len(ours) else np.zeros(0, bool)
-    largest = float(np.abs(sent[~same] - given_again[~same]).max()) if (~same).any() else 0.0
+    """Compare rows (row, step, channel) by time; return the counts, and which published rows are equal (row,)."""
+    _, published_rows, recomputed_rows = np.intersect1d(published_ns, recomputed_ns, return_indices=True)
+    sent, predicted_again = (
+        np.ascontiguousarray(values, np.float32) for values in (published[published_rows], recomputed[recomputed_rows])
+    )
+    same = (
+        (sent.view(np.int32) == predicted_again.view(np.int32)).all(axis=(1, 2))
+        if len(published_rows)
+        else np.zeros(0, bool)
+    )
+    largest = float(np.abs(sent[~same] - predicted_again[~same]).max()) if (~same).any() else 0.0
     equal = np.zeros(len(published_ns), bool)
-    equal[ours] = same
-    result = Equality(len(published_ns), len(recomputed_ns), len(ours), int(same.sum()), largest)
+    equal[published_rows] = same
+    result = Equality(len(published_ns), len(recomputed_ns), len(published_rows), int(same.sum()), largest)
     return result, equal
 
 
 def at(t_ns: Times, values: AnyFloats, groups: Int64s, usable: Bools, wanted_ns: Times) -> Floats:
-    """Return values (wanted, channel) at times, linear between rows (time, channel) of a group, or NaN if there are none.
+    """Return values (wanted, channel) at times, linear between rows (time, channel) of a group; NaN where there are none.
 
     >>> t_ns, values = np.array([0, 10, 20]), np.array([[0.0], [5.0], [7.0]])
     >>> groups, usable = np.array([0, 0, 1]), np.array([True, True, True])
@@ -73,12 +79,13 @@ def targets(rows_ns: Times, row: Times, steps: tuple[int, ...], period_ns: float
     >>> targets(np.array([0, 7, 20]), np.array([0, 7]), (1, 2), None).tolist()
     [[7, 20], [20, -1]]
     """
+    target_ns: Times
     if period_ns is not None:
-        target_ns: Times = row[:, None] + np.rint(np.array(steps) * period_ns).astype(np.int64)
+        target_ns = row[:, None] + np.rint(np.array(steps) * period_ns).astype(np.int64)
         return target_ns
-    places = np.searchsorted(rows_ns, row)[:, None] + np.array(steps)
-    later: Times = np.append(rows_ns, -1)[np.minimum(places, len(rows_ns))]
-    return later
+    target_rows = np.searchsorted(rows_ns, row)[:, None] + np.array(steps)
+    target_ns = np.append(rows_ns, -1)[np.minimum(target_rows, len(rows_ns))]
+    return target_ns
 
 
 def sums(predicted: AnyFloats, truth: AnyFloats) -> tuple[Floats, Floats]:
@@ -107,16 +114,10 @@ class Session(NamedTuple):
 def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> LiveMeasures:
     """Return the metrics of some sessions together; mean absolute errors are in the unit of the channels."""
     rows = sum(session.rows for session in sessions)
-    mae = {
-        name: {
-            f"t{step}": float(
-                f"{sum(session.sums[name][1][place] for session in sessions if session.sums) / rows / channels:.9g}"
-            )
-            for place, step in enumerate(steps)
-        }
-        for name in PREDICTORS
-        if rows
-    }
+    mae: dict[str, dict[str, float]] = {}
+    for name in PREDICTORS if rows else ():
+        absolute: Any = sum(session.sums[name][1] for session in sessions if session.sums) / rows / channels  # (step,)
+        mae[name] = {f"t{step}": float(f"{absolute[index]:.9g}") for index, step in enumerate(steps)}
     equalities = [session.equality for session in sessions]
     return {
         "rows": {

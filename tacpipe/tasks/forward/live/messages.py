@@ -21,6 +21,7 @@ QUANTILES: frozenset[str] = frozenset({"quantiles"})
 
 
 def _value_columns(sizes: MessageSizes) -> list[LiveColumn]:
+    """Return the columns of predicted values: each channel at each step."""
     return [
         LiveColumn(f"{channel}_t{step}", sizes.unit, {"step": str(step)})
         for step in sizes.steps
@@ -29,6 +30,7 @@ def _value_columns(sizes: MessageSizes) -> list[LiveColumn]:
 
 
 def _quantile_columns(sizes: MessageSizes) -> list[LiveColumn]:
+    """Return the columns of quantiles: each value column at each level."""
     return [
         LiveColumn(f"{name}_q{level}", unit, {**metadata, "quantile": f"{level / 100:g}"})
         for level in sizes.quantiles

@@ -45,7 +45,7 @@ def predict(
     if quantiles:
         forecaster.quantiles_of(quantiles)
     outputs: dict[str, RecordingOutput] = {}
-    without, unplanned, row_count = [], 0, 0
+    notes, unplanned, row_count = [], 0, 0
     with terminal.progress_bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
@@ -55,16 +55,16 @@ def predict(
             except TacpipeError as error:
                 raise type(error)(f"{name}: {error}") from error
             if not outputs[name].streams[""].num_rows:
-                without.append(f"{name}: no forecast could be made at any grid point ({_describe_causes(causes)}).")
+                notes.append(f"{name}: no forecast could be made at any grid point ({_describe_causes(causes)}).")
             unplanned += causes[Cause.NO_PLAN]
             row_count += outputs[name].streams[""].num_rows
             advance(note=name)
     if unplanned:
-        without.append(
+        notes.append(
             f"{unplanned} of {row_count} forecasts are without a plan (there is no stream {PLAN!r} in the recording by "
             f"then): the hand was assumed to move on as it did."
         )
-    return Result(outputs, notes=without)
+    return Result(outputs, notes=notes)
 
 
 def _predict_recording(
@@ -76,7 +76,10 @@ def _predict_recording(
     *,
     allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
-    """Return the predictions of a recording, and the number of grid points by cause."""
+    """Return the predictions of a recording, and the number of grid points by cause.
+
+    Raises `TacpipeError` for a step beyond the horizon, or streams that the model does not read.
+    """
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
@@ -122,10 +125,15 @@ def build_chain(
     """
     schemas = {name: table.schema for name, table in tables.items()}
     plan = str(recording.attributes.get("live_plan", ""))
-    source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
-    master, source = str(recording.attributes.get("master", "")), source if source in schemas else ""
+    stream = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     return LiveChain.for_model(
-        forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles, allow_look_ahead=allow_look_ahead
+        forecaster,
+        steps,
+        schemas,
+        str(recording.attributes.get("master", "")),
+        plan_from=stream if stream in schemas else "",
+        quantiles=quantiles,
+        allow_look_ahead=allow_look_ahead,
     )
 
 

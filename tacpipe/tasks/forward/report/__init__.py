@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +66,10 @@ class ForwardReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return further columns for the table of all methods: skill by step, and errors if channels have other units."""
+        """Return further columns for the table of all methods: skill by step, errors in several units, and windows.
+
+        Each is a heading and a function that returns its cell in a row.
+        """
         steps, known_objects = _steps(context), _known_objects(comparison.question)
         unit = comparison.measure.unit
 
@@ -120,13 +124,13 @@ class ForwardReport(TaskReport):
         ]
 
     def caveats(self, context: Context) -> list[str]:
-        """Return the limitations of these results."""
+        """Return the limitations of these results; empty strings for those that do not apply."""
         runs = [run.details for run in context.runs]
         known_by_recording: dict[str, set[bool]] = {}
         values: dict[str, set[Any]] = {}
         for run in runs:
-            for name, setting_values in zip(run.errors.recordings, run.errors.known, strict=True):
-                known_by_recording.setdefault(name, set()).add(bool(setting_values))
+            for name, is_known in zip(run.errors.recordings, run.errors.known, strict=True):
+                known_by_recording.setdefault(name, set()).add(bool(is_known))
             for name in SETTINGS:
                 if run.config["params"].get(name) is not None:
                     values.setdefault(name, set()).add(run.config["params"][name])
@@ -136,11 +140,8 @@ class ForwardReport(TaskReport):
         counts = [run.metrics.fresh.counts for run in runs[:1]]
         mixed = "For some recordings, the object is known to one run and unseen by another."
         effective = [
-            (
-                f"{setting_values['windows']:,} overlapping windows are equivalent to about "
-                f"{setting_values['effective_windows']:,}"
-            )
-            for setting_values in counts
+            f"{count['windows']:,} overlapping windows are equivalent to about {count['effective_windows']:,}"
+            for count in counts
         ]
         return [
             f"Settings: {settings}." if settings else "",
@@ -149,7 +150,7 @@ class ForwardReport(TaskReport):
             "the geometric mean of the ratios over recordings. All predictions are decoded to the unit of the channels "
             "before the evaluation, so all rows can be compared. Errors without a step are means over all steps.",
             f"In the first run, {effective[0]}." if effective else "",
-            mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
+            mixed if any(len(values_of_recording) > 1 for values_of_recording in known_by_recording.values()) else "",
             "The plan is the recorded motion, so errors of methods that read it are valid for an arm that follows its plan "
             "perfectly."
             if any(run.actions == "planned" for run in runs)
@@ -172,9 +173,8 @@ def _look_ahead_notes(context: Context) -> list[str]:
     """Return how far the training rows of models look ahead, with the methods' names if they differ."""
     methods: dict[str, list[str]] = {}
     for method in context.methods:
-        for note in dict.fromkeys(
-            note for run in method.runs for note in headline.look_ahead_notes(run.details.config)
-        ):
+        notes = [headline.look_ahead_notes(run.details.config) for run in method.runs]
+        for note in dict.fromkeys(itertools.chain.from_iterable(notes)):
             methods.setdefault(note, []).append(method.name)
     return [
         note if len(names) == len(context.methods) else f"{blocks.listed(names)}: {note}"
@@ -193,14 +193,14 @@ def _skill_ahead_charts(context: Context) -> list[Fold]:
         rate_hz = float(config.get("rate_hz") or 0)
         steps = _all_steps(context)
         x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
-        lines, cut = [], []
+        lines, cut_off = [], []
         for row in rows:
             interval = skill.skill_intervals(skill.sums_of_row(row, steps, _known_objects(comparison.question)))
             mean, low, high = (getattr(interval, name)[:-1] for name in ("mean", "low", "high"))
             lines.append(Curve(row.name, x, mean, low, high, dashed=row.kind != "model"))
-            cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
+            cut_off += [row.name] if float(np.nanmin(mean)) < FLOOR else []
         caption = "Bands: 95 % intervals over recordings. Dashed: a baseline. Click a name to show only this method."
-        caption += f" Ends at {blocks.signed(FLOOR, 1)}, above some of {blocks.listed(cut)}." if cut else ""
+        caption += f" Ends at {blocks.signed(FLOOR, 1)}, above some of {blocks.listed(cut_off)}." if cut_off else ""
         spec = charts.lines(
             lines, f"time ahead ({'ms' if rate_hz else 'steps'})", "skill over persistence", order=order,
             level=("persistence", 0.0), floor=FLOOR,
@@ -269,6 +269,7 @@ def _ablations(context: Context) -> list[Fold]:
 
 
 def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
+    """Return a table of skill with and without the plan of methods that differ only in ``actions``; empty without any."""
     rows: list[Sequence[str | Cell]] = []
     for family in _families(context.methods, "actions"):
         planned = next((candidate for candidate in family if candidate.settings["actions"] == "planned"), None)
@@ -296,6 +297,7 @@ def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None
 
 
 def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
+    """Return a table of methods that differ only in the timeline; empty without any."""
     rows: list[Sequence[str | Cell]] = []
     for family in _families(context.methods, "timeline"):
         for method in sorted(family, key=lambda candidate: str(candidate.settings["timeline"])):

@@ -29,6 +29,7 @@ def live_folds(context: Context) -> list[Fold]:
 
 
 def _live_tables(run: ComparedRun, live: LiveMetrics) -> list[Table]:
+    """Return the tables of a live session's errors, rows and latency, and alarms, without those that would be empty."""
     steps = sorted(next(iter(live["mae"].values()), {}), key=lambda step: int(step.removeprefix("t")))
     errors: list[Cells] = [
         [LIVE_NAMES.get(name, name), *(number(by_step[step]) for step in steps)]

@@ -64,6 +64,7 @@ def predictor_title(predictor: str) -> str:
 
 
 def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Chart]:
+    """Return a chart of the root mean squared error of each predictor by time ahead."""
     predictors, rate_hz = run.details.metrics.fresh.predictors, run.details.rate_hz
     steps = sorted(int(name[1:]) for name in predictors[names[0]]["mse_counts"]["both"] if name != "mean")
     x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
@@ -88,6 +89,7 @@ def _rmse_charts(run: ComparedRun, names: Sequence[str], unit: str) -> list[Char
 
 
 def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> list[Table]:
+    """Return the tables of errors by step, of skill, and by sensor, axis and part of the recordings."""
     predictors = metrics.fresh.predictors
     groups = predictors[names[0]]["mae_counts"]
     steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in groups["both"]] + ["mean"]
@@ -157,7 +159,7 @@ def _describe_floor(metrics: ForwardMetrics, unit: str) -> str:
 
 
 def _describe_seen(metrics: ForwardMetrics) -> str:
-    """Return the errors on training recordings, which do not show how well the model generalizes."""
+    """Return the number and mean skill of training recordings, which are left out; empty without any."""
     seen = metrics.parts.get("seen")
     described = seen.skill[headline.GEOMETRIC].get("mean", {}) if seen else {}
     if not seen or "mean" not in described:
@@ -168,6 +170,7 @@ def _describe_seen(metrics: ForwardMetrics) -> str:
 
 
 def _error_cell(interval_tree: Mapping[str, float]) -> Cell:
+    """Return a cell with a mean and its interval, which may lack its bounds or be empty."""
     return (
         blocks.interval(interval_tree["mean"], interval_tree.get("low", np.nan), interval_tree.get("high", np.nan))
         if "mean" in interval_tree
@@ -232,7 +235,10 @@ def paper_representative(context: Context) -> Method | None:
 
 
 def _representatives(context: Context) -> list[tuple[Method, ComparedRun]]:
-    """Return a median run of the best method of the last part, and one of the paper's method, which are shown in detail."""
+    """Return a median run of the best method of the last part, and one of the paper's method, which are shown in detail.
+
+    With up to two runs, all methods are shown.
+    """
     compared = [candidate for candidate in context.comparisons if candidate.best]
     last = next(
         (candidate for candidate in reversed(compared) if candidate.question.place < 2), next(iter(compared), None)

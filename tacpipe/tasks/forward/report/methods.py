@@ -206,7 +206,7 @@ def is_recurrent(method: Method) -> bool:
 
 
 def paper_method(methods: Sequence[Method]) -> Method | None:
-    """Return the method nearest to the best of the paper: the recurrent model with 20 principal components."""
+    """Return the method nearest to the best of the paper, the recurrent model with 20 principal components, or None."""
     candidates = [method for method in methods if is_recurrent(method) and codec_of(method)["of"] == "levels"]
     return min(candidates, key=_distance, default=None)
 
@@ -234,7 +234,7 @@ def paper_row(codec: CodecDescription) -> str | None:
 
 
 def _distance(method: Method) -> tuple[int, int, int, str]:
-    """Return a sort key by the distance of a recurrent method from the paper's."""
+    """Return a sort key by the distance of a recurrent method from the paper's: kind and number of latents, runs, name."""
     codec = codec_of(method)
     kind = codec["kind"]
     off = abs(int(codec["latents"]) - _PAPER_WIDTH.get(kind, int(codec["latents"])))
@@ -298,6 +298,10 @@ def object_clusters(run: ForwardResult, known_objects: bool | None) -> dict[str,
 
 
 def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
+    """Return a result as a run of its method, with the errors of each predictor by question.
+
+    ``usual`` is the timeline that is not named.
+    """
     config = run.config
     elsewhere = run.timeline != usual
     timeline = f"{run.timeline} timeline" if elsewhere else ""

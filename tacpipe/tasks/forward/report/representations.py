@@ -76,7 +76,7 @@ def codec_losses(codecs: Sequence[StoredCodec]) -> list[CodecLoss]:
 
 
 def paper_codec(codecs: Sequence[StoredCodec], series: str, latents: int) -> StoredCodec | None:
-    """Return the codec of a series with a covariance whose width is nearest to ``latents``."""
+    """Return the codec of a series with a covariance whose width is nearest to ``latents``; None without one."""
     candidates = [
         candidate for candidate in codecs if codec_series(candidate) == series and candidate.get("latent_covariance")
     ]
@@ -133,10 +133,10 @@ def represent_method(method: Method) -> Representation | None:
         total = np.sum(error_sums, axis=0) if error_sums else None
         return None if total is None else float((total[: len(steps)] / total[-1]).mean())
 
-    def over(predictor: str, known_objects: bool | None = None) -> list[float]:
+    def errors_over_runs(predictor: str, known_objects: bool | None = None) -> list[float]:
         return [value for run in method.runs if (value := error(run, predictor, known_objects)) is not None]
 
-    tested, known_objects = over(MODEL), over(MODEL, True)
+    tested, known_objects = errors_over_runs(MODEL), errors_over_runs(MODEL, True)
     if not tested:
         return None
     # the recurrent model is trained with this error, so its loss is a result, too
@@ -148,12 +148,15 @@ def represent_method(method: Method) -> Representation | None:
         spread([float(tree) for tree in described if tree is not None]),
         spread(tested),
         spread(known_objects) if known_objects else None,
-        spread(over("persistence")),
+        spread(errors_over_runs("persistence")),
     )
 
 
 def _representation_table(context: Context) -> Table | None:
-    """Return the results of the recurrent model on each representation, as in Table 1 if the data are the paper's."""
+    """Return the results of the recurrent model on each representation, as in Table 1 if the data are the paper's.
+
+    None if no recurrent model has them.
+    """
     published, order = context.published, list(PRINTED)
     recurrent_methods = [represented for represented in context.methods if methods.is_recurrent(represented)]
 
@@ -172,11 +175,8 @@ def _representation_table(context: Context) -> Table | None:
         cells: list[str | Cell] = [
             blocks.with_sd(part.mean, part.sd) for part in (represented.validation, represented.test)
         ]
-        cells += (
-            [blocks.with_sd(represented.known.mean, represented.known.sd) if represented.known else NONE]
-            if has_objects
-            else []
-        )
+        if has_objects:
+            cells.append(blocks.with_sd(represented.known.mean, represented.known.sd) if represented.known else NONE)
         cells.append(blocks.with_sd(represented.persistence.mean, represented.persistence.sd))
         cells.append(
             number(represented.test.mean / represented.persistence.mean, 3) if represented.persistence.mean else NONE
@@ -208,6 +208,7 @@ def _representation_table(context: Context) -> Table | None:
 
 
 def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts | Table]:
+    """Return charts of the codecs' variance, covariance and loss, and a table of their losses; empty without codecs."""
     if not codecs:
         return []
     drawn = []
@@ -216,7 +217,7 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
         kept_latents, ratio = int(pca["latents"]), pca["explained_ratio"]
         printed = "; in the paper, 20 explain 82 %" if published else ""
         caption = f"The {kept_latents} latents explain {100 * sum(ratio[:kept_latents]):.1f} %{printed}."
-        values = {str(index): 100 * float(share) for index, share in enumerate(ratio[:COMPONENTS], 1)}
+        values = {str(index): 100 * float(fraction) for index, fraction in enumerate(ratio[:COMPONENTS], 1)}
         title = f"Variance by principal component{', Figure 4 of the paper' if published else ''}"
         drawn.append(
             Chart(title, charts.bars(values, "principal component", "variance (%)", marked=kept_latents), caption)
@@ -229,8 +230,8 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
             drawn.append(Chart(f"Covariance between the {codec['latents']} latents of {name}", spec, caption))
     losses = codec_losses(codecs)
     series: dict[str, dict[int, float]] = {}
-    for share in losses:
-        series.setdefault(share.series, {})[share.latents] = share.mse_standardised
+    for loss in losses:
+        series.setdefault(loss.series, {})[loss.latents] = loss.mse_standardised
     if any(len(widths) > 1 for widths in series.values()):
         lines = [
             Curve(name, sorted(by_width), [by_width[width] for width in sorted(by_width)])
@@ -241,14 +242,14 @@ def _codec_charts(codecs: Sequence[StoredCodec], published: bool) -> list[Charts
         drawn.append(Chart("Reconstruction error by number of latents", spec, caption))
     rows = [
         [
-            share.series,
-            str(share.latents),
-            f"{share.mse_standardised:.4f}",
-            number(share.mae_counts),
-            "held out" if share.part == "val" else "of the fit",
-            str(share.codecs),
+            loss.series,
+            str(loss.latents),
+            f"{loss.mse_standardised:.4f}",
+            number(loss.mae_counts),
+            "held out" if loss.part == "val" else "of the fit",
+            str(loss.codecs),
         ]
-        for share in losses
+        for loss in losses
     ]
     heads = ["", "latents", "MSE (standardised)", "MAE (channels' unit)", "training recordings", "codecs"]
     lost = [table("Reconstruction errors of the representations", heads, rows)] if rows else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -118,7 +119,7 @@ def situation_folds(context: Context) -> list[Fold]:
 def skill_in_situation(method: Method, situation: str) -> dict[str, float] | None:
     """Return windows, errors, skill and the fraction of persistence's error in a situation, pooled over runs.
 
-    Skill is weighted by windows; for a single run it has an interval.
+    Skill is weighted by windows; for a single run it has an interval. None if no run has skill in the situation.
     """
     trees = [run.details.metrics.situations for run in method.runs]
     selected = [part[situation] for part in trees if situation in part and "mean" in part[situation]["skill"]]
@@ -129,9 +130,8 @@ def skill_in_situation(method: Method, situation: str) -> dict[str, float] | Non
     def mean(values: list[float]) -> float:
         return float(np.average(values, weights=weights))
 
-    total_error = sum(
-        part["windows"] * part["mae_counts"][BASELINE]["mean"] for tree in trees for part in tree.values()
-    )
+    parts = itertools.chain.from_iterable(tree.values() for tree in trees)
+    total_error = sum(part["windows"] * part["mae_counts"][BASELINE]["mean"] for part in parts)
     persistence_error = mean([part["mae_counts"][BASELINE]["mean"] for part in selected])
     ends = selected[0]["skill"]["mean"] if len(method.runs) == 1 else {}
     return {

@@ -78,7 +78,7 @@ class MaterialEngine(Engine):
 
     @property
     def beginning(self) -> RunningRecording | None:
-        """Marker of a running recording."""
+        """Marker of a running recording; None if none is running."""
         return RunningRecording() if self.running else None
 
     def describe(self, model: str) -> MaterialDescription:

@@ -98,12 +98,12 @@ class MaterialMessage(messages.Message):
 
     @property
     def probability(self) -> float | None:
-        """Probability of the material."""
+        """Probability of the material; None without a prediction."""
         return None if self.probabilities is None else self.probabilities.tolist()[self.class_number]
 
     @property
     def probabilities_by_name(self) -> dict[str, float] | None:
-        """Probability of each material."""
+        """Probability of each material; None without a prediction."""
         return None if self.probabilities is None else dict(zip(self.names, self.probabilities.tolist(), strict=True))
 
     @property

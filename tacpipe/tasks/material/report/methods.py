@@ -299,7 +299,7 @@ def read_runs(results: Sequence[Dataset]) -> list[ComparedRun]:
 
 
 def question_on(run: ComparedRun, sensor: str) -> Question | None:
-    """Return the question that a run answers for slides of a sensor."""
+    """Return the question that a run answers for slides of a sensor, or None."""
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 

@@ -166,7 +166,7 @@ def independent_method(methods: Sequence[Method], joint: Method) -> Method | Non
 
 
 def permuted_method(methods: Sequence[Method], joint: Method) -> Method | None:
-    """Return the control that is most similar to a joint method."""
+    """Return the control that is most similar to a joint method, or None without controls."""
     return nearest_method(joint, [method for method in methods if is_control(method)])
 
 

@@ -67,7 +67,7 @@ def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
                 *("--duration-s", f"{IDLE_S + LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
             )
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
-    return _show(output, world, epoch_ns)
+    return _show_session(output, world, epoch_ns)
 
 
 def _train(output: Path, seed: int) -> None:
@@ -88,8 +88,11 @@ def _tacpipe(*words: str) -> None:
         raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
 
 
-def _show(output: Path, world: World, epoch_ns: int) -> Path:
-    """Print and draw the last session next to the slips of the simulation."""
+def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
+    """Print and draw the last session next to the slips of the simulation; return the path of the picture.
+
+    Raises `TacpipeError` if the session began after the first trial.
+    """
     import tacpipe
 
     recordings = tacpipe.open(output / "live")
@@ -111,17 +114,17 @@ def _show(output: Path, world: World, epoch_ns: int) -> Path:
     answered = stream["alarm"].to_numpy() >= 0
     alarms = score_session(model, track, t_ns[answered], stream["alarm"].to_numpy()[answered] > 0)
     latency_ms = recording.table("latency")["latency_ms"].to_numpy()
-    text = described(alarms)
-    terminal.note(f"\n{text}\n{latency_in_words(latency_ms)}")
+    text = describe_alarms(alarms)
+    terminal.note(f"\n{text}\n{describe_latency(latency_ms)}")
     return draw(output / "live.png", stream, track, alarms, text)
 
 
-def described(alarms: SessionAlarms) -> str:
+def describe_alarms(alarms: SessionAlarms) -> str:
     """Return what an alarm did in words.
 
     >>> event = EventScore("a", "b", 1.0, 120.0, 0.0, 200.0)
     >>> missed = EventScore("a", "b", 1.0, float("nan"), 30.0, 50.0)
-    >>> described(SessionAlarms([event, missed], 1, 0.5))
+    >>> describe_alarms(SessionAlarms([event, missed], 1, 0.5))
     'alarm before 1 of 2 slips, 60 ms or more before 1; median lead 120 ms; 1 false alarm in 30 s of other contact'
     """
     leads = [event.lead_ms for event in alarms.events if event.lead_ms == event.lead_ms]
@@ -133,10 +136,10 @@ def described(alarms: SessionAlarms) -> str:
     )
 
 
-def latency_in_words(latency_ms: AnyFloats) -> str:
+def describe_latency(latency_ms: AnyFloats) -> str:
     """Return median, 99th percentile and maximum of latencies; NaN is left out.
 
-    >>> latency_in_words(np.array([1.0, 3.0, np.nan]))
+    >>> describe_latency(np.array([1.0, 3.0, np.nan]))
     'latency: median 2.0 ms, 99 % 3.0 ms, largest 3.0 ms, of 2 probabilities'
     """
     finite = latency_ms[np.isfinite(latency_ms)]
@@ -149,7 +152,10 @@ def latency_in_words(latency_ms: AnyFloats) -> str:
 
 
 def draw(path: Path, stream: Any, track: GraspTrack, alarms: SessionAlarms, headline: str) -> Path:
-    """Draw the probability of a session with its alarms and the slips of the simulation, and each slip enlarged."""
+    """Draw the probability of a session with its alarms and the slips of the simulation, and each slip enlarged.
+
+    Returns ``path``, to which the picture is written.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -172,8 +178,8 @@ def draw(path: Path, stream: Any, track: GraspTrack, alarms: SessionAlarms, head
     upper.set_xlabel("time, s")
     upper.set_ylabel("probability of a slip")
     upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
-    for place, begin in enumerate(near[:, 0].tolist()):
-        axes = figure.add_subplot(grid[1, place])
+    for column, begin in enumerate(near[:, 0].tolist()):
+        axes = figure.add_subplot(grid[1, column])
         since_ms = (t_ns - begin) / 1e6
         rows = (since_ms >= -BEFORE_MS) & (since_ms <= AFTER_MS)
         axes.axvline(0.0, color=SLIPPED, linewidth=2)

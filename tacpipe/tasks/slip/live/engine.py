@@ -51,6 +51,7 @@ class FingerSoFar:
     """The rows of a finger up to now."""
 
     def __init__(self, finger: Finger, rest_ns: int, rest: list[float] | None = None) -> None:
+        """Start without rows; ``rest`` are levels that were measured before, None to measure them over ``rest_ns``."""
         self.finger, self.rest_ns = finger, rest_ns
         self.rest: Floats | None = np.array(rest) if rest is not None else None
         self._first: list[tuple[Times, AnyFloats]] = []  # batches before the level at rest is measured
@@ -61,7 +62,8 @@ class FingerSoFar:
         self._begin = 0  # first row after the level at rest
 
     def add(self, t_ns: Times, raw: AnyFloats) -> None:
-        """Append rows."""
+        """Append rows (row,) and (row, channel); rows before the level at rest is measured are added when it is."""
+        times, values = t_ns, raw
         if self.rest is None:
             self._first.append((t_ns, raw))
             times, values = (np.concatenate([batch[part] for batch in self._first]) for part in (0, 1))
@@ -70,11 +72,10 @@ class FingerSoFar:
                 return
             self.rest, self._begin = measured
             self._first = []
-            t_ns, raw = times, values
-        scaled = fill_missing((raw - self.rest) / self.finger.scale, self._filled)
+        scaled = fill_missing((values - self.rest) / self.finger.scale, self._filled)
         if len(scaled):
             self._filled = scaled[-1]
-        self.t_ns, self.values = np.concatenate([self.t_ns, t_ns]), np.concatenate([self.values, scaled])
+        self.t_ns, self.values = np.concatenate([self.t_ns, times]), np.concatenate([self.values, scaled])
         kept = self.finger.rows + SPARE_ROWS
         if len(self.t_ns) > 2 * kept:
             self._dropped += len(self.t_ns) - kept
@@ -104,6 +105,7 @@ class SlipEngine(Engine):
         *,
         settle_ns: int = SETTLE_NS,
     ) -> None:
+        """Start without samples; ``level`` is the score from which the alarm is on."""
         super().__init__(sensors, settle_ns)
         self._model, self._description, self._level = model, description, level
         self._late = 0
@@ -124,7 +126,7 @@ class SlipEngine(Engine):
 
     @property
     def beginning(self) -> RestLevels | None:
-        """The levels at rest, once all are measured."""
+        """The levels at rest; None until all are measured."""
         levels = {name: so_far.rest for name, so_far in self._fingers.items()}
         measured = {name: level.tolist() for name, level in levels.items() if level is not None}
         return RestLevels(measured) if len(measured) == len(levels) else None
@@ -184,7 +186,7 @@ class SlipEngine(Engine):
         while self._pending and self._pending[0] <= until_ns:
             due.append(self._pending.popleft())
         self.skipped += max(0, len(due) - BEHIND)
-        messages = [self._message(t_ns) for t_ns in due[-BEHIND:]]
+        messages = [self._predict(t_ns) for t_ns in due[-BEHIND:]]
         if not messages:
             return self._silence(now_ns)
         self._heard_ns = now_ns
@@ -194,6 +196,7 @@ class SlipEngine(Engine):
         return messages
 
     def _restart(self, rest: Mapping[str, list[float]] | None = None) -> None:
+        """Discard all rows; ``rest`` are known levels at rest by stream, others are measured again."""
         reader = self._model.reader
         self._fingers = {
             finger.stream: FingerSoFar(finger, reader.rest_ns, (rest or {}).get(finger.stream))
@@ -203,6 +206,7 @@ class SlipEngine(Engine):
         self._read_ns, self._why = 0, ""
 
     def _decode(self, offset_ns: int) -> None:
+        """Decode new samples and plans, and note the times of the first finger's samples."""
         first = self._model.reader.fingers[0].stream
         for name, decoder in self._decoders.items():
             for batch in decoder.batches():
@@ -219,7 +223,8 @@ class SlipEngine(Engine):
                 if name == first:
                     self._pending.extend(t_ns.tolist())
 
-    def _message(self, t_ns: int) -> SlipMessage:
+    def _predict(self, t_ns: int) -> SlipMessage:
+        """Return the message for the sample of the first finger at ``t_ns``, with a cause if a window is not full."""
         windows = [self._fingers[finger.stream].window(t_ns) for finger in self._model.reader.fingers]
         self._read_ns = max(self._read_ns, t_ns)
         missing = [
@@ -243,7 +248,7 @@ class SlipEngine(Engine):
         return SlipMessage(self.next_seq(), t_ns, probability, score, state, touch, made_from_t_ns=max(newest))
 
     def _silence(self, now_ns: int) -> list[SlipMessage]:
-        """Return a message without a probability if there was no sample for too long."""
+        """Return a message without a probability if there was no sample for too long, else nothing."""
         assert self._offset_ns is not None
         if self._heard_ns is None:
             self._heard_ns = now_ns

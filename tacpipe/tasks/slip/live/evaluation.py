@@ -55,20 +55,20 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
 
 
 def _session(model: SlipModel, recording: Recording) -> dict[str, Any]:
-    """Return the figures of one recorded session."""
+    """Return the figures of one recorded session: counts of rows, latency, and alarms if slips are labelled."""
     stream, predicted = recording.table(SLIP), model.table(recording)
     clock = "t_device_ns" if "t_device_ns" in stream.column_names else "t_ns"
     published = {name: stream[name].to_numpy() for name in (clock, "probability", "score", "alarm")}
     answered = np.isfinite(published["probability"])
     times = published[clock][answered]
-    _, ours, theirs = np.intersect1d(times, predicted["t_ns"].to_numpy(), return_indices=True)
-    same = np.ones(len(ours), bool)
+    _, published_rows, predicted_rows = np.intersect1d(times, predicted["t_ns"].to_numpy(), return_indices=True)
+    same = np.ones(len(published_rows), bool)
     for name in ("probability", "score"):
-        sent, computed = published[name][answered][ours], predicted[name].to_numpy()[theirs]
+        sent, computed = published[name][answered][published_rows], predicted[name].to_numpy()[predicted_rows]
         same &= sent.view(np.int64) == computed.view(np.int64)
     session: dict[str, Any] = {
         "published": int(answered.sum()),
-        "compared": len(ours),
+        "compared": len(published_rows),
         "equal": int(same.sum()),
         "latency": summarize_latencies(recording.table("latency")["latency_ms"].to_numpy()),
     }

@@ -119,12 +119,12 @@ class TouchMessage(messages.Message):
 
     @property
     def best(self) -> int | None:
-        """Index of the best grasp."""
+        """Index of the best grasp; None without ranks."""
         return self.ranks.index(1) if self.ranks else None
 
     @property
     def candidates(self) -> list[CandidateJson] | None:
-        """All grasps, as JSON."""
+        """All grasps, as JSON; None without predictions."""
         return None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))]
 
     def _candidate(self, row: int) -> CandidateJson:

@@ -58,7 +58,7 @@ class TouchResult(context.ReportResult[TouchConfig]):
 
     @property
     def trained(self) -> int | None:
-        """Number of grasps that the weights were fitted to."""
+        """Number of grasps that the weights were fitted to; None if the model does not state it."""
         return self.config.get("counts", {}).get("train")
 
     @cached_property

@@ -268,7 +268,7 @@ def methods_by_value(methods: Sequence[Method], form: Form) -> dict[object, Meth
 
 
 def score_on_target(method: Method) -> Score | None:
-    """Return the score of a method on the target for which the paper compares settings."""
+    """Return the score of a method on the target for which the paper compares settings, or None without predictions."""
     return predictions.score(predictions_of_runs(method), TARGET, True)
 
 
