@@ -144,7 +144,7 @@ def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_dam
     age(lab)
     path = Path(lab.store.object_path(name))
     path.chmod(0o644)
-    path.write_bytes(path.read_bytes().replace(b"trial-001", b"trial-002"))
+    path.write_bytes(path.read_bytes().replace(b"trial-00", b"trial-01"))
     before = sorted(lab.store.root.glob("objects/*/*"))
     failed = lab.call("store gc --grace-days 0")
     assert failed.code == 4 and name[:12] in failed.err and "nothing was removed" in failed.err
