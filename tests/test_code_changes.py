@@ -13,6 +13,7 @@ from tests.conftest import Lab, make_once, tacpipe, write_plugin, write_source
 STAGES = '''
 """Stages of a lab."""
 
+from __future__ import annotations
 from dataclasses import dataclass
 from tacpipe import RecordingOutput, stage
 
