@@ -118,7 +118,7 @@ test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, i
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
 
 test-paged: $(VENV)/.dev ## run the tests of stores and datasets with every dataset of two recordings or more divided into pages
-	@PYTHONPATH=tests/paged $(PYTEST) -m "not faults and not long and not rig" $(PAGED)
+	@PYTHONPATH=tests/paged $(PYTEST) -m "not faults and not long and not rig and not inline" $(PAGED)
 
 test-slurm: $(VENV)/.dev ## start Slurm on this computer, as root, and put the questions of all executors to its jobs
 	@if ! command -v slurmctld > /dev/null; then $(call debian,$(SLURM)); fi

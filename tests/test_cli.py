@@ -99,6 +99,7 @@ def test_show_tells_rows_rates_and_labels(lab: Lab) -> None:
     assert "trial-000" in lab.run("show data/s").out
 
 
+@pytest.mark.inline
 def test_a_label_is_kept_in_the_manifest_and_numbers_are_numbers(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("label data/r trial-000 trial-002 --set force_n=1.5 --set wet=true --set note='rough side'")

@@ -50,6 +50,7 @@ def test_nothing_that_a_root_or_its_ancestors_need_is_removed(lab: Lab) -> None:
     assert counts(lab.run("total data/s -o data/t --json").out) == (0, 1)
 
 
+@pytest.mark.inline
 def test_what_an_output_held_before_is_removed_and_a_dry_run_only_counts(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")

@@ -25,6 +25,7 @@ def many_recordings(lab: Lab) -> Lab:
     return lab
 
 
+@pytest.mark.inline
 def test_show_reads_the_shards_of_the_recordings_that_it_lists(many_recordings: Lab, file_calls: FileCalls) -> None:
     file_calls.clear()
     text = many_recordings.run("show data/r").out
@@ -42,6 +43,7 @@ def inodes(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_ino for path in folder.rglob("*.parquet")}
 
 
+@pytest.mark.inline
 def test_a_label_reads_and_writes_no_shard(many_recordings: Lab, file_calls: FileCalls) -> None:
     before = inodes(many_recordings.folder / "data/r")
     assert len(before) == MANY * STREAMS

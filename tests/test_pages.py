@@ -82,6 +82,7 @@ def divide_into_pages(grouped: int) -> Iterator[None]:
         yield
 
 
+@pytest.mark.inline
 def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had() -> None:
     entry: RecordingEntry = {"attributes": {}, "shards": {"": {"digest": "0" * 64, "rows": 1, "bytes": 1}}}
     thousand, thousand_and_one = ({f"r{number:05d}": entry for number in range(count)} for count in (1000, 1001))

@@ -241,6 +241,7 @@ def test_a_dataset_copied_without_its_store_opens_and_is_adopted(lab: Lab, monke
     assert any((lab.folder / "other" / "objects" / name[:2] / name).exists() for name in names)
 
 
+@pytest.mark.inline
 def test_a_manifest_edited_by_hand_is_refused(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     path = Path("data/r/manifest.json")
@@ -358,6 +359,7 @@ def test_shards_are_linked_and_recordings_copied(lab: Lab) -> None:
     assert Path("data/r/trial-000/left.parquet").stat().st_ino != Path(lab.store.object_path(stream)).stat().st_ino
 
 
+@pytest.mark.inline
 def test_the_manifest_is_deterministic_and_its_digest_ignores_how_it_was_made(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/a --factor 2")

@@ -368,6 +368,7 @@ def test_a_directory_that_was_deleted_keeps_its_recordings_and_labels_in_the_sto
         shutil.rmtree("data/r")
 
 
+@pytest.mark.inline
 def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checked_out(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")

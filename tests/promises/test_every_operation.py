@@ -97,6 +97,7 @@ def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tm
     assert trial["problems"]
 
 
+@pytest.mark.inline
 def test_a_rerun_changes_nothing_on_the_disk_and_so_needs_none_that_can_be_written(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")

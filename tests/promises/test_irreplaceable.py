@@ -149,6 +149,7 @@ def test_a_bit_flipped_anywhere_in_a_record_of_a_recording_costs_no_recording(
         assert lost(lab, manifests, path) == []
 
 
+@pytest.mark.inline
 @pytest.mark.parametrize("folder", ["records", "roots", "objects"])
 def test_records_roots_or_manifests_alone_keep_every_recording(
     project: Path, lab: Lab, manifests: list[Manifest], folder: str
@@ -173,6 +174,7 @@ def test_records_roots_or_manifests_alone_keep_every_recording(
     assert list(specimen.beneath(lab.store.root / "objects")) == [] or folder == "roots"
 
 
+@pytest.mark.inline
 @pytest.mark.parametrize(
     ("only", "removed", "before", "after"),
     [

@@ -237,6 +237,7 @@ def test_a_hit_elsewhere_takes_one_request_an_object_and_few_more(computers: Com
     assert files.steps < 2 * 20 + 25  # there are two streams
 
 
+@pytest.mark.inline
 def test_status_list_and_checkout_show_what_the_bucket_holds(computers: Computers) -> None:
     computers.run("first", SIMULATE, SCALE)
     computers.enter("second")
@@ -253,6 +254,7 @@ def test_status_list_and_checkout_show_what_the_bucket_holds(computers: Computer
     assert "s3://lab/store" in computers.lab.run("store status").out
 
 
+@pytest.mark.inline
 def test_copies_here_are_cleared_and_brought_again(computers: Computers, files: Stepping) -> None:
     folder = computers.enter("first")
     computers.run("first", SIMULATE, SCALE)
@@ -366,6 +368,7 @@ def test_a_repair_states_what_this_computer_cannot_have_again(computers: Compute
     assert ran.code == 4 and name in ran.out and "cannot be recomputed" in ran.out
 
 
+@pytest.mark.inline
 def test_what_a_collection_took_is_computed_again(computers: Computers, files: Stepping) -> None:
     computers.run("first", SIMULATE, SCALE)
     shutil.rmtree("data/s")

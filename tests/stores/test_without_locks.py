@@ -95,6 +95,7 @@ def test_a_push_at_any_step_of_a_collection_finds_or_brings_all_that_it_needs(
         count("pushes beside collections, without locks")
 
 
+@pytest.mark.inline
 @EVERY
 def test_a_collection_that_is_killed_at_any_step_loses_nothing_and_the_next_one_ends_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes], stride: int
