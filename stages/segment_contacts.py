@@ -61,7 +61,7 @@ class Params(StreamSelection):
     # thresholds of streams in counts: unit, on_count and off_count; noise, computed from noise at rest as in other
     # units
     thresholds: Literal["unit", "noise"] = added("unit")
-    # position of rest_s: start of the recording; lowest: where the channels together are lowest
+    # position of rest_s: start (of the recording), or lowest (where the channels together are lowest)
     rest: Literal["start", "lowest"] = added("start")
 
     def check(self) -> None:

@@ -89,7 +89,7 @@ def _add_label(program: typer.Typer) -> None:
             refuse_others(names, label, exclude, include, interval)
             label_from_table(dataset, from_, key, dry_run=dry_run, as_json=as_json)
             return
-        refuse_alone(names, key, dry_run)
+        check_labels_without_table(names, key, dry_run)
         assert names is not None
         parsed_labels = {} if interval and not label else labels.parse(label or [], exclude, include=include)
         changed = labels.change(dataset, names, parsed_labels, interval)
@@ -305,8 +305,8 @@ def label_intervals(dataset: Path, path: Path, *, as_json: bool) -> None:
     terminal.result(changed.directory)
 
 
-def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
-    """Raise `UsageError` if options of --from are used without it, or if no recording is named."""
+def check_labels_without_table(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
+    """Check the options of a call without --from. Raises `UsageError` if one needs it, or if no recording is named."""
     if key or dry_run:
         raise UsageError("--key and --dry-run belong to --from. Leave them out, or give a table with --from.")
     if not names:

@@ -217,11 +217,14 @@ class Moments:
     def mean_and_scale(self, representation: str) -> tuple[AnyFloats, AnyFloats]:
         """Return mean and scale of each channel, both (channel,), as `tacpipe.codecs.measures.mean_and_scale`.
 
+        The mean is 0 unless ``representation`` is levels. The scale is the standard deviation, or 1 for a constant channel.
+
         Raises `TacpipeError` if all channels are constant.
         """
         if not self.varies.any():
             raise no_moving_channel_error(len(self._low), self.count)
         spread = np.sqrt(np.square(self.centred_triangle).sum(axis=0) / self.count)
+        # The first row of the triangle is the count and the sums of channels, over the root of the count.
         mean = self._triangle[0, 1:] / self._triangle[0, 0] if representation == LEVELS else np.zeros(len(spread))
         return mean, np.where(self.varies, spread, 1.0)
 

@@ -201,7 +201,7 @@ class ByRecording:
         model_chain = model.chain
         if list(source.chain) != list(model_chain[: len(source.chain)]):
             raise UsageError(
-                f"The model was trained behind other stages than {dataset_name} went through: "
+                f"The model was trained on recordings of other stages than {dataset_name} went through: "
                 f"{selection.chain_difference(model_chain, source.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
@@ -210,8 +210,8 @@ class ByRecording:
             stage = registry.load(step["stage"])
             if stage.version != step["version"]:
                 raise UsageError(
-                    f"The model was trained behind version {step['version']} of {step['stage']}; this tacpipe has version "
-                    f"{stage.version}. Train it again."
+                    f"The model was trained on the output of version {step['version']} of {step['stage']}; this "
+                    f"tacpipe has version {stage.version}. Train it again."
                 )
             recordings = self.run_step(replayed, step, dataset_dirs)
             files = {name: model.files[name] for name in step["fitted"] or {}}

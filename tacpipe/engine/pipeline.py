@@ -320,8 +320,9 @@ class _RequestRun:
     def _identity_of_argument(self, name: str, kind: str) -> Any:
         """Return the part of the key for an argument that is not a single recording, such as a dataset or a model.
 
-        Recordings are replayed through the model's chain, and selected by role if there is a split. Raises `UsageError`
-        for ``--role`` without a split.
+        Recordings are replayed through the model's chain, unless the stage takes them as given. With a split, those of the
+        role that ``name`` names are selected, otherwise those of ``--role`` or test. None if there is no initial model.
+        Raises `UsageError` for ``--role`` without a split.
         """
         inputs, reads = self.inputs, self.stage.reads
         if kind == "Model" and name == "init":

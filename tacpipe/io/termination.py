@@ -62,12 +62,17 @@ class _Program:
         self.code: int | None = None  # exit code of a finished command
         self.restore: Callable[[], None] = lambda: None  # resets the terminal
 
-    def ask(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: raise `KeyboardInterrupt` for the first request, and end immediately for the second."""
+    def handle_signal(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: raise `KeyboardInterrupt` for the first request, and end the program at the second.
+
+        While `deferred`, the first request is only noted. Repeats of a request are ignored, as is SIGHUP while ending.
+        """
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
-        if not self.by_main_thread.is_new_request() or (hung_up and self.ending):
+        if hung_up and self.ending:
+            return
+        if not self.by_main_thread.is_new_request():
             return
         if self.ending or self.code is not None:
             self.end()
@@ -119,7 +124,7 @@ def install_handlers() -> None:
     """
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _program.ask)
+            signal.signal(number, _program.handle_signal)
     wakeups, wakes = os.pipe()
     os.set_blocking(wakes, False)
     signal.set_wakeup_fd(wakes, warn_on_full_buffer=False)

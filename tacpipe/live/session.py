@@ -94,7 +94,8 @@ class Supervisor:
         self.report: SessionFigures = {}  # last report of the running process
         self.deaths = 0
         self.ready = False
-        self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)  # counts of processes that have ended
+        # sums over the processes that have ended
+        self._totals: dict[Counted, int] = dict.fromkeys(get_args(Counted), 0)
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         self._lines = wire.LineCutter()

@@ -336,9 +336,10 @@ def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, d
 def _sweep(
     store: Store, needed: LiveObjects, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
 ) -> None:
-    """Remove drafts, leases and checkpoints of ended runs, and files that have long been in quarantine.
+    """Remove old drafts, leases of ended runs, checkpoints of stored results, and notes of directories.
 
-    Quarantined files that may contain recordings are retained, unless ``doubtful`` is set.
+    Files that were quarantined ``grace_days`` ago or earlier are removed, but those that may contain recordings only if
+    ``doubtful``. With ``dry_run``, drafts and checkpoints are only counted.
     """
     now_s = time.time()
     for path in layout.entries(store.root, "tmp"):

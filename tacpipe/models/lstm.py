@@ -156,7 +156,7 @@ class _Layer(torch.autograd.Function):
             tanh.sigmoid_()
             torch.add(minus_one, tanh, alpha=2, out=tanh)
             torch.mul(o, tanh, out=every_h[step + 1])
-        ctx.set_materialize_grads(False)  # otherwise an encoder's unused states would be returned as zeros
+        ctx.set_materialize_grads(False)  # otherwise the gradients of unused states would be zeros instead of None
         ctx.save_for_backward(from_input, from_state, step_inputs_pool, gates, cells, tanhs)
         return step_inputs_pool[1:, :, :size], every_h[-1].clone(), every_c[-1].clone()
 

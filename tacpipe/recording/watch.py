@@ -22,7 +22,7 @@ from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 
-WINDOW_NS = 2_000_000_000  # window of rate and jitter
+WINDOW_NS = 2_000_000_000  # window over which rate and jitter are measured
 REST_S = 0.5  # window over which the rest level of a tactile channel is averaged
 
 

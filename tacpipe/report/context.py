@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Config = TypeVar("Config", bound="ModelConfig")
 CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `tacpipe calibrate` adds
-# setting of a method on the recordings of a paper: `ReportResult.epochs_of_paper`, if not empty
+# setting of a method that has fewer epochs than that of the paper (`ReportResult.epochs_of_paper`)
 SHORTENED = "shortened"
 GROWS = "trained_on"  # a part that also contains the recordings of the calibration
 

@@ -332,7 +332,7 @@ def source_folds(context: Context) -> list[Fold]:
 
 
 def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
-    """Return the counts of methods, results and recordings or other clusters as texts, without those of a single result."""
+    """Return the counts of methods, results (if there are several) and clusters, such as "40 recordings"."""
     counts = []
     if context.methods:
         counts.append(counted(len(context.methods), "methods"))
@@ -342,7 +342,5 @@ def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
     for run in context.runs:
         recording_names.update(*(errors.sums.get(MODEL, {}) for errors in run.questions.values()))
     if recording_names:
-        names = {comparison.measure.cluster for comparison in context.comparisons}
-        word = next(iter(names)) if len(names) == 1 else context.comparisons[0].measure.cluster
-        counts.append(counted(len(recording_names), word))
+        counts.append(counted(len(recording_names), context.comparisons[0].measure.cluster))
     return counts

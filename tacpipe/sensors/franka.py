@@ -32,7 +32,7 @@ MAX_MESSAGE = 1 << 20  # bytes
 RATE_HZ = 1000.0  # fixed by the device
 JOINTS = 7
 FLAGS = 41  # kinds of errors
-AFFINE = 1e-3  # tolerance of the last row of a pose to (0, 0, 0, 1)
+AFFINE = 1e-3  # maximum deviation of the last row of a pose from (0, 0, 0, 1)
 
 POSE, INERTIA = 16, 9  # number of matrix elements, in column-major order
 FLOATS = {  # number of floats by name, in order

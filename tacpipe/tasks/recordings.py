@@ -57,14 +57,14 @@ def _check_stages(expected: Sequence[Step], recordings: Dataset) -> None:
     chain = recordings.source.chain
     if list(chain) != list(expected[: len(chain)]):
         raise UsageError(
-            f"These recordings went through other stages than those that the model was trained behind: "
+            f"These recordings went through other stages than the recordings that the model was trained on: "
             f"{chain_difference(expected, chain)}. Give the recordings before that stage."
         )
     if recordings.path is None:
         missing = ", then ".join(f"`tacpipe {_command(step)}`" for step in expected[len(chain) :])
         raise UsageError(
-            f"These recordings did not go through all stages that the model was trained behind: {missing} is missing. "
-            f"Run it, or give what tacpipe.open returned."
+            f"These recordings did not go through all stages of the recordings that the model was trained on: {missing} is "
+            f"missing. Run it, or give what tacpipe.open returned."
         )
 
 

@@ -168,7 +168,7 @@ class TrainingWork(Protocol):
     def loss(self, model: nn.Module, batch: Any, epoch: int) -> tuple[Tensor, int]:
         """Return the loss to minimise and the weight of the batch in the epoch's mean."""
 
-    def watch(self, model: nn.Module) -> Validated:
+    def validate(self, model: nn.Module) -> Validated:
         """Validate the model: return ``val_loss`` and further entries of the epoch's line."""
 
     def ranks(self, line: Line) -> Mapping[str, Sequence[float]]:
@@ -203,7 +203,7 @@ class WindowTraining:
         """Return the mean loss of the windows with these indices, and their number."""
         return self.training.loss(model, batch), len(batch)
 
-    def watch(self, model: nn.Module) -> Validated:
+    def validate(self, model: nn.Module) -> Validated:
         """Return the mean loss over all validation windows."""
         total: Tensor | float = 0.0
         for indices in _chunks(torch.arange(self.validation.count), self.batch):
@@ -337,7 +337,7 @@ def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, fo
         followers.batch((step + 1) / len(batches), functools.partial(_mean, total, count))
     run.model.eval()
     with torch.no_grad():
-        validated = work.watch(run.model)
+        validated = work.validate(run.model)
     line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **validated}  # type: ignore[typeddict-item]  # no labels
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(

@@ -42,7 +42,11 @@ def read_records(path: Path) -> Iterator[Record]:
 
 
 def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
-    """Yield the records in ``file``, an MCAP file at its first byte. Raises the same errors as `read_records`."""
+    """Yield the records in ``file``, an MCAP file at its first byte.
+
+    If the file is damaged or messages are missing, the last record is a `BagDamage`. Raises the same errors as
+    `read_records`.
+    """
     if file.read(len(MAGIC)) != MAGIC:
         raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
     reader = _RecordConverter(path)

@@ -184,7 +184,7 @@ def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = 
 def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 
-    If the layout's ``stream`` sets neither time nor columns, the container's declarations apply. Metadata of the time
+    Where the layout's ``stream`` sets no time or no columns, those of the container apply. Metadata of the time
     column are copied to ``t_ns``. A column of images becomes packets. Raises the errors of `stream_batches`.
     """
     timed_stream = stream if stream.time.is_declared else replace(stream, time=source.time)

@@ -171,7 +171,11 @@ class Transmission:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
 
     def _send(self, items: Sequence[SentItem], now_ns: int) -> None:
-        """Send items to all hosts, and add them to the ledger with what the first of them accepted."""
+        """Send items to all hosts, and add to the ledger what the first host accepted.
+
+        A patient stream queues them for its first streaming host instead. A host that does not stream gets the frames that
+        it requested.
+        """
         if not items:
             return
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)

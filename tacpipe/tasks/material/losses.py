@@ -325,7 +325,7 @@ class JointWork:
         valid[filled] = (self.training[sensor].classes[rows[filled]] != NONE).cpu()
         return latents, valid.to(latents.device)
 
-    def watch(self, model: nn.Module) -> Validated:
+    def validate(self, model: nn.Module) -> Validated:
         """Return the epoch's training losses, and losses and accuracy of each sensor on its validation slides."""
         evaluated = {
             sensor: self._evaluate_network(model.get_submodule(sensor), slides)

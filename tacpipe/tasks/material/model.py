@@ -103,7 +103,7 @@ class MaterialModel(Classifier):
         ``probabilities`` adds a ``probability_…`` of each class and the ``answer``, a name or unknown. Convert it to a
         data frame with ``.to_pandas()``. Scores of a dataset equal those of the command exactly; those of a single
         recording may differ in the last digits of float32, because slides are computed in batches. Raises `UsageError`
-        if the recordings did not pass through the stages that the model was trained behind.
+        if the recordings did not pass through the same stages as the training recordings.
 
         **Arrays**: ``slides`` are device counts (slide, time, channel), or one slide (time, channel) as returned by
         `frames`; ``sensor`` may be omitted if the model has only one. Returns materials (slide,), int64, or text if

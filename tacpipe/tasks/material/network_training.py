@@ -274,13 +274,16 @@ def _build_networks(
 
 
 def _best_epochs(history: Sequence[Line], joint: bool) -> BestEpochs:
-    """Return the epoch of each sensor's weights, and the validation accuracy at that epoch."""
+    """Return the epoch of the best validation accuracy of each sensor, the latest of equal ones, and that accuracy.
 
-    def chosen(sensor: str) -> Line:
+    If ``joint``, the epoch has the highest sum of accuracies over sensors.
+    """
+
+    def best_line(sensor: str) -> Line:
         sensors = list(history[0]["val"]) if joint else [sensor]
         return max(history, key=lambda line: (sum(line["val"][name]["accuracy"] for name in sensors), line["epoch"]))
 
-    best_lines = {sensor: chosen(sensor) for sensor in history[0]["val"]}
+    best_lines = {sensor: best_line(sensor) for sensor in history[0]["val"]}
     return {
         "epoch": {sensor: line["epoch"] for sensor, line in best_lines.items()},
         "accuracy": {sensor: line["val"][sensor]["accuracy"] for sensor, line in best_lines.items()},

@@ -79,7 +79,7 @@ class SlipModel:
         """Return a table with one row per sample of the first finger with full windows; by name for a dataset.
 
         Columns are ``t_ns``, ``probability``, ``score`` and one alarm per rate of false alarms, ``alarm_1``. Raises
-        `UsageError` if the recordings did not pass through the stages that the model was trained behind.
+        `UsageError` if the recordings did not pass through the same stages as the training recordings.
         """
         opened = open_for_model(recordings, self.chain)
         tables = {name: self.table(recording) for name, recording in opened.recordings.items()}

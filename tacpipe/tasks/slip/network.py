@@ -115,7 +115,7 @@ class WindowWork:
         """Return the loss of a batch of windows, and its size."""
         return self._loss(model, batch.numpy()), len(batch)
 
-    def watch(self, model: nn.Module) -> Validated:
+    def validate(self, model: nn.Module) -> Validated:
         """Return the loss over the windows that are held out."""
         with torch.no_grad():
             parts = [self.held_out[first : first + 1024] for first in range(0, len(self.held_out), 1024)]

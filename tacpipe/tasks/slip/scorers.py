@@ -35,7 +35,7 @@ class Scorer(Protocol):
         ...
 
     def score_features(self, features: Floats) -> Floats | None:
-        """Return scores (row,) of features (row, feature) with the time behind them; None if it reads other inputs."""
+        """Return scores (row,) of features (row, feature), the last of which is the time; None if it reads other inputs."""
         ...
 
     def score_window(self, reader: FingerReader, windows: Sequence[AnyFloats]) -> float:
@@ -55,7 +55,7 @@ class Scorer(Protocol):
 class FeatureScorer(ABC):
     """A scorer that reads some columns of the features."""
 
-    columns: tuple[int, ...]  # columns of the features with the time behind them
+    columns: tuple[int, ...]  # columns of the features, the last of which is the time
 
     @property
     def runs_live(self) -> bool:
@@ -64,7 +64,7 @@ class FeatureScorer(ABC):
 
     @abstractmethod
     def score_features(self, features: Floats) -> Floats:
-        """Return scores (row,) of features (row, feature) with the time behind them."""
+        """Return scores (row,) of features (row, feature), the last of which is the time."""
 
     @abstractmethod
     def arrays(self) -> dict[str, AnyArray]:
@@ -111,7 +111,7 @@ class BoostedScorer(FeatureScorer):
         return cls(chosen, trees)
 
     def score_features(self, features: Floats) -> Floats:
-        """Return scores (row,) of features (row, feature) with the time behind them."""
+        """Return scores (row,) of features (row, feature), the last of which is the time."""
         return self.trees.scores(features[:, self.columns])
 
     def arrays(self) -> dict[str, AnyArray]:
@@ -149,7 +149,7 @@ class LinearScorer(FeatureScorer):
         return cls(columns, means, deviations, model.coef_[0].astype(np.float64), model.intercept_.astype(np.float64))
 
     def score_features(self, features: Floats) -> Floats:
-        """Return the log odds (row,) of features (row, feature) with the time behind them."""
+        """Return the log odds (row,) of features (row, feature), the last of which is the time."""
         rows = _standardise(features[:, self.columns], self.means, self.deviations)
         scores: Floats = (rows * self.weights).sum(axis=1) + self.base[0]
         return scores

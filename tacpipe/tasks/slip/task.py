@@ -90,7 +90,7 @@ class SlipTask(Task):
         return predict(model.files, recordings)
 
     def load(self, files: Files, chain: OpenedChain | None = None) -> SlipModel:
-        """Return the model in ``files``, trained behind the stages of ``chain``."""
+        """Return the model in ``files``, trained on the output of the stages of ``chain``."""
         from tacpipe.tasks.slip.model import SlipModel
 
         return SlipModel.load(files, chain)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 STABLE, BEFORE, DURING, UNCOUNTED = 0, 1, 2, -1  # states of a row
 BLOCK = 256  # windows whose features are computed at once
-TIME = "time since the start"  # column behind the features, which only the baseline time_only reads
+TIME = "time since the start"  # last column of the features, which only the baseline time_only reads
 MATCH_NS = 1_000_000_000  # width of the bins of time since the start in which windows are matched
 
 
@@ -243,8 +243,8 @@ class FingerReader:
         missing = sorted(set(names) - set(recording.columns(stream).column_names))
         if missing:
             raise TacpipeError(
-                f"{recording.name} has no column {missing[0]}, which the model reads. Give recordings after the stages that "
-                f"it was trained behind."
+                f"{recording.name} has no column {missing[0]}, which the model reads. Give recordings that went "
+                f"through the same stages as the training recordings."
             )
         return recording.table(stream, names)
 
@@ -293,7 +293,7 @@ class FingerReader:
         )
 
     def features(self, track: GraspTrack, rows: Indices) -> Floats:
-        """Return the features of rows of a track (row, feature), with the time since the start behind them."""
+        """Return the features of rows of a track (row, feature); the last column is the time since the start."""
         columns = self.feature_count
         features = np.empty((len(rows), columns + 1))
         for first in range(0, len(rows), BLOCK):
@@ -410,7 +410,7 @@ class TrainingWindows:
     params: SlipModelParams
     track: Indices  # (window,), index of its track
     rows: Indices  # (window,), row of its track
-    features: Floats  # (window, feature), with the time since the start behind them
+    features: Floats  # (window, feature); the last column is the time since the start
     slips: Bools  # (window,), whether the object slips within the horizon
     weights: Floats  # (window,)
 

@@ -92,7 +92,7 @@ class TouchWork:
         arrays = self.training.sources.draw(batch.tolist(), rng)
         return self._loss(output(model, arrays), self.training.values[batch]), len(batch)
 
-    def watch(self, model: nn.Module) -> Validated:
+    def validate(self, model: nn.Module) -> Validated:
         """Return the loss over all validation grasps, with points that do not change between epochs."""
         predicted = predictions(model, self.watched.sources, len(self.watched), draws=1)
         values = self.watched.values

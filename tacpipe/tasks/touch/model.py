@@ -78,7 +78,7 @@ class TouchModel(Predictor):
         writes: one row per grasp with ``recording`` and the predicted values in device counts, such as ``pdc_th`` and
         ``e_mf_07``, float32. ``quantiles`` (percent, among those of `tacpipe calibrate`) adds columns such as
         ``e_mf_07_q90``. Convert it to a data frame with ``.to_pandas()``. Raises `UsageError` if the recordings did not
-        pass through the stages that the model was trained behind.
+        pass through the same stages as the training recordings.
 
         **A cloud and a grasp**, in metres and in the same frame, give the reading of this grasp. Raises `TacpipeError`
         if the grasp is far from the cloud, or if either lacks an input of the model.

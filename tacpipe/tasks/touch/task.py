@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
-OBJECTS, GRASPS = 1, 90  # objects per family, of six families; grasps per object
+OBJECTS, GRASPS = 1, 90  # objects in each of six families, and grasps per object
 
 
 def demo(output: Path) -> Demo:

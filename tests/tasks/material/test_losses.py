@@ -114,7 +114,7 @@ def test_slides_without_label_are_made_again_and_neither_named_nor_aligned() -> 
 def test_an_epochs_line_tells_accuracy_as_a_share_of_all_validation_slides() -> None:
     job, model = work(Weights()), networks()
     batch(job)
-    line = job.watch(model)
+    line = job.validate(model)
     for name in SHAPES:
         predicted = model[name](job.validation[name].batch(torch.arange(8))).scores.argmax(dim=1)
         assert line["val"][name]["accuracy"] == int((predicted == CLASSES).sum()) / 8
@@ -136,7 +136,7 @@ def test_a_network_without_decoder_learns_from_classes_alone() -> None:
             for name in SHAPES
         )
     assert float(job.loss(model, rows, 30)[0].detach()) == pytest.approx(float(expected), rel=1e-6)
-    assert "reconstruction" not in job.watch(model)["val"]["a"]
+    assert "reconstruction" not in job.validate(model)["val"]["a"]
 
 
 def test_contrast_is_the_supervised_contrastive_loss_between_sensors() -> None:

@@ -282,7 +282,7 @@ def test_a_model_trained_behind_a_stage_has_no_causal_predictions() -> None:
             chain = ({"stage": "extract.difference"},)
 
     opened: Any = Chained()
-    with pytest.raises(TacpipeError, match="trained behind `tacpipe extract difference`"):
+    with pytest.raises(TacpipeError, match="trained on the output of `tacpipe extract difference`"):
         SlipLive().predict(opened, dataset(), None)  # type: ignore[arg-type]
 
 

@@ -93,7 +93,7 @@ def test_the_loss_of_a_batch_draws_points_anew_and_what_is_watched_stays() -> No
     assert count == 2
     assert first.item() != second.item()
     expected = np.sqrt(np.mean(np.arange(7.0) ** 2) + 1e-6)
-    assert [touch_work.watch(model)["val_loss"] for _ in range(2)] == pytest.approx([expected] * 2)
+    assert [touch_work.validate(model)["val_loss"] for _ in range(2)] == pytest.approx([expected] * 2)
     assert touch_work.ranks({"epoch": 1, "train_loss": 1.0, "val_loss": 0.25}) == {"": (0.25,)}
 
 

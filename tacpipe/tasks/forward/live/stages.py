@@ -39,15 +39,15 @@ def causal_stages(steps: Sequence[Step]) -> CausalStages:
         name = step["stage"]
         if name not in (SYNCHRONIZE, CONTACTS, *CHANNELS) and not name.startswith(COMPRESS):
             raise TacpipeError(
-                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which cannot run live. Train "
-                f"one behind synchronize, segment contacts and, optionally, extract markers or difference, and compress."
+                f"The model was trained on the output of `tacpipe {name.replace('.', ' ')}`, which cannot run live. Train "
+                f"one after synchronize, segment contacts and, optionally, extract markers or difference, and compress."
             )
         params_by_stage[name] = stage_params(step)
     missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in params_by_stage]
     if missing:
         raise TacpipeError(
-            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so the session cannot compute its "
-            f"rows from samples. Train it on recordings that went through that stage."
+            f"The model was not trained on the output of `tacpipe {missing[0].replace('.', ' ')}`, so the session "
+            f"cannot compute its rows from samples. Train it on recordings that went through that stage."
         )
     if params_by_stage[CONTACTS].rest != "start":
         raise TacpipeError(

@@ -52,8 +52,8 @@ def slide_params(steps: Sequence[Step]) -> Any:
     if names != [SLIDES]:
         commands = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
         raise TacpipeError(
-            f"The model was trained behind {commands}, but a session cuts slides with `tacpipe segment slides` only. "
-            "Train it on recordings that went through that stage."
+            f"The model was trained on the output of {commands}, but a session cuts slides with `tacpipe segment "
+            "slides` only. Train it on recordings that went through that stage."
         )
     params_found = stage_params(steps[0])
     if params_found.trigger == "load" and params_found.rest != "start":

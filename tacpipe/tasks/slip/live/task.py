@@ -44,8 +44,8 @@ class SlipLive(LiveTask):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of probabilities and latencies.
 
-        Raises `TacpipeError` if the model was trained behind a stage, or does not run live; `UsageError` if the rig lacks a
-        stream of the model, the model an alarm, or a model that reads plans a source of them.
+        Raises `TacpipeError` if the model was trained on the output of a stage, or does not run live; `UsageError` if the
+        rig lacks a stream of the model, the model an alarm, or a model that reads plans a source of them.
         """
         from tacpipe.datasets import model_files
         from tacpipe.live import plans
@@ -132,12 +132,13 @@ def _own(settings: Settings) -> SlipSettings:
 
 
 def _require_recorded(model: Model) -> None:
-    """Raise `TacpipeError` if a model was trained behind a stage, whose rows a session does not have."""
+    """Raise `TacpipeError` if a model was trained on the output of a stage, which a session does not run."""
     steps = [step["stage"] for step in model.source.chain]
     if steps:
         raise TacpipeError(
-            f"The model was trained behind `tacpipe {steps[0].replace('.', ' ')}`, and a session reads samples as they are "
-            f"recorded. Train it on recordings, with slips labelled by `tacpipe label RECORDINGS --interval slip FROM TO`."
+            f"The model was trained on the output of `tacpipe {steps[0].replace('.', ' ')}`, and a session reads "
+            f"samples as they are recorded. Train it on recordings, with slips labelled by "
+            "`tacpipe label RECORDINGS --interval slip FROM TO`."
         )
 
 

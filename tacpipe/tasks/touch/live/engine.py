@@ -106,8 +106,8 @@ class Criterion(NamedTuple):
 def criterion(text: str) -> Criterion:
     """Return the criterion of an option value. Raises `UsageError` if it is unknown.
 
-    ``contact`` is the mean of both fingers' levels, ``balance`` their negative difference, and ``level:0.4`` the
-    closeness of their mean to 0.4.
+    ``contact`` is the mean of both fingers' levels, ``balance`` the negative absolute difference between them, and
+    ``level:0.4`` the negative distance of their mean from 0.4.
     """
     name, colon, value = text.partition(":")
     if name == CONTACT and not colon:
