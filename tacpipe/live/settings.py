@@ -110,10 +110,6 @@ class Settings:
                 raise
             raise UsageError(f"{self.places[name]}: {str(error).replace(option(name), name)}") from error
 
-    def name_in_errors(self, name: str) -> str:
-        """Return the name of a key in errors: file and key if a file sets it, else its option."""
-        return f"{self.places[name]}: {name}" if name in self.places else option(name)
-
 
 @dataclass(frozen=True)
 class SessionOptions:

@@ -7,8 +7,6 @@ these are 0 and each change by one count would be a spike, so there is also a sm
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Times
@@ -91,16 +89,9 @@ def repeated_rows(values: AnyArray) -> Bools:
     >>> repeated_rows(np.array([[1, 2], [1, 2], [1, 3]])).tolist()
     [False, True, False]
     """
-    return repeated_in_columns(list(values.T))
-
-
-def repeated_in_columns(columns: Iterable[AnyArray]) -> Bools:
-    """Return the result of `repeated_rows` for separate channels (time,). Stops as soon as no row is repeated."""
-    repeated = np.zeros(0, dtype=bool)
-    for number, column in enumerate(columns):
-        if not number:
-            repeated = np.ones(len(column), dtype=bool)
-            repeated[:1] = False
+    repeated = np.full(len(values), values.shape[1] > 0)
+    repeated[:1] = False
+    for column in values.T:
         repeated[1:] &= column[1:] == column[:-1]
         if not repeated.any():
             break

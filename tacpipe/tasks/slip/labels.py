@@ -20,7 +20,6 @@ from tacpipe.signals.runs import runs
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
-ATTRIBUTE = "slip_intervals"
 COLUMNS = ("slip", "slip_slip", "gt_slip")  # columns of stages, synchronized label streams and the simulator
 # columns of `segment contacts` and `segment losses`, and of the simulator; negative without contact
 CONTACT = ("contact", "gt_contact")

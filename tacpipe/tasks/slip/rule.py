@@ -79,6 +79,8 @@ class RuleScorer:
 
     def forecasts(self, recording: Recording) -> pa.Table:
         """Return the forecasts of a recording, with the metadata of their columns, which `ForwardModel.predict` lacks."""
+        import pyarrow as pa
+
         from tacpipe.datasets import model_files
         from tacpipe.tasks.recordings import OpenedChain, open_for_model
         from tacpipe.tasks.task import PredictionRequest
@@ -88,7 +90,7 @@ class RuleScorer:
         result = model_files.task(model.files, self.path).predict(model, opened, PredictionRequest(STEPS))
         (output,) = result.recordings.values()
         rows = output.streams[""]
-        return rows if hasattr(rows, "num_rows") else rows.read_all()
+        return rows if isinstance(rows, pa.Table) else rows.read_all()
 
     def score(self, reader: FingerReader, track: GraspTrack, rows: Indices) -> Floats:
         """Return the scores of rows of a track (row,), each by the newest forecast; 0 before the first one.
