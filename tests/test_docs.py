@@ -214,17 +214,20 @@ def test_every_block_of_commands_or_python_runs_or_states_why_it_does_not() -> N
     assert sum(block.language == "console" for page in RUN for block in fenced_blocks(page.read_text())) >= 10
 
 
-def test_what_pages_import_from_the_library_exists() -> None:
+def test_what_pages_use_of_the_library_exists() -> None:
     missing = []
     for page in PAGES:
-        for module_name, words in re.findall(r"^ *from (tacpipe[.\w]*) import (.+)$", page.read_text(), re.MULTILINE):
+        text = page.read_text()
+        for module_name, words in re.findall(r"^ *from (tacpipe[.\w]*) import (.+)$", text, re.MULTILINE):
             module = importlib.import_module(module_name)
             folder = Path(module.__file__ or "").parent
-            missing += [
-                f"{page.name}: {module_name}.{name}"
-                for name in (word.split(" as ")[0].strip(" ()") for word in words.split("#")[0].split(","))
-                if name and not hasattr(module, name) and not any(folder.glob(f"{name}.py"))
-            ]
+            for name in (word.split(" as ")[0].strip(" ()") for word in words.split("#")[0].split(",")):
+                if (folder / f"{name}.py").exists():
+                    imported = importlib.import_module(f"{module_name}.{name}")
+                    attributes = set(re.findall(rf"(?<![\w.]){name}\.(\w+)\(", text))
+                    missing += [f"{page.name}: {name}.{attribute}" for attribute in attributes - set(dir(imported))]
+                elif name and not hasattr(module, name):
+                    missing.append(f"{page.name}: {module_name}.{name}")
     assert missing == []
 
 

@@ -244,8 +244,8 @@ HELD = (
 GELS = (
     "simulate gel --trials 3 --duration-s 4 -o data/g",
     "split data/g -o data/gs --scheme random --val 0 --test 0.34",
-    "extract autoencoder data/g --split data/gs -o data/f --images 40 --components 4 --epochs 2",
-    "extract encoder data/g --weights data/f/encoder.safetensors -o data/e",
+    "extract autoencoder data/g --split data/gs -o data/f --streams gel1 --images 40 --components 4 --epochs 2",
+    "extract encoder data/g --streams gel1 --weights data/f/encoder.safetensors -o data/e",
 )
 STAGES = (
     *_cases_of_chain("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from tacpipe.engine import execution
 from tacpipe.io.hashing import digest
-from tacpipe.plugins.stage import AnyStage, Result, Stage
+from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 
 
 class Replay:
@@ -23,7 +25,7 @@ class Replay:
         self._identity = ""
         self._read: Callable[[str, str], bytes] = _refuse_read
         self._events: list[tuple[Any, ...]] = []
-        self._recorded: dict[str, tuple[list[tuple[Any, ...]], Any]] = {}
+        self._recorded: dict[str, tuple[list[tuple[Any, ...]], Callable[[], Any]]] = {}
         self._parquet: dict[int, tuple[Any, bytes]] = {}
 
     def install(self) -> None:
@@ -75,10 +77,11 @@ class Replay:
             start, identity = len(self._events), self._identity
             returned = run()
             if self.listening and not stage.source:
-                returned = _repeatable(returned)
-                self._recorded[identity] = self._events[start:], returned
+                repeat = _repeatable(returned)
+                self._recorded[identity] = self._events[start:], repeat
+                return repeat()
             return returned
-        events, returned = recorded
+        events, repeat = recorded
         place = workspace or Path()
         for kind, *details in events:
             if kind == "read":
@@ -87,20 +90,34 @@ class Replay:
                 self._save(place, *details)
             else:
                 self._resume(place)
-        return returned
+        return repeat()
 
 
-def _repeatable(returned: Any) -> Any:
-    """Return a result whose files can be written more than once, as those of a stage need not."""
+def _repeatable(returned: Any) -> Callable[[], Any]:
+    """Return a function that returns a result again, whose files and streams of a stage can be consumed only once."""
+    if isinstance(returned, RecordingOutput):
+        streams = {
+            name: (stream, None) if isinstance(stream, pa.Table) else (stream.schema, list(stream))
+            for name, stream in returned.streams.items()
+        }
+        return lambda: dataclasses.replace(
+            returned, tables={name: _stream(*content) for name, content in streams.items()}
+        )
     if not isinstance(returned, Result) or not returned.written:
-        return returned
+        return lambda: returned
     contents = {}
     for name, write in returned.written.items():
         sink = io.BytesIO()
         write(sink)
         contents[name] = sink.getvalue()
     writers = {name: functools.partial(_write, content) for name, content in contents.items()}
-    return dataclasses.replace(returned, written=writers)
+    repeatable = dataclasses.replace(returned, written=writers)
+    return lambda: repeatable
+
+
+def _stream(content: Any, batches: list[pa.RecordBatch] | None) -> pa.Table | pa.RecordBatchReader:
+    """Return a table, or a reader that yields the ``batches`` of a schema."""
+    return content if batches is None else pa.RecordBatchReader.from_batches(content, batches)
 
 
 def _write(content: bytes, sink: Any) -> None:

@@ -223,7 +223,7 @@ def as_ordinary_user(project: Specimen, words: str, program: str = "tacpipe") ->
 
 
 @pytest.fixture(params=["read-only", *seldom("of another user")])
-def locked(project: Specimen, request: pytest.FixtureRequest) -> Any:
+def locked(project: Specimen, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A project whose store may be read and not written."""
     try:
         subprocess.run(["true"], preexec_fn=ordinary, check=True)
@@ -233,6 +233,7 @@ def locked(project: Specimen, request: pytest.FixtureRequest) -> Any:
     if request.param == "of another user":
         if os.getuid():
             pytest.skip("only root can give files to another user")
+        monkeypatch.setenv("TACPIPE_STORE", str(project.store))  # the store of another user is used on request only
         for path in paths:
             os.chown(path, 12345, 12345)
     else:
