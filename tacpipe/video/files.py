@@ -100,6 +100,11 @@ def scan(path: Path) -> VideoScan:
     pts, dts, is_key_frame, sizes = (list(column) for column in zip(*packets, strict=True))
     if None in pts or len(set(pts)) < len(pts) or (delayed and DEMUXERS[path.suffix.lower()] in WITHOUT_PTS):
         order = _presentation_order(path, video_format) if delayed else list(range(len(packets)))
+        if len(order) > len(packets):
+            raise TacpipeError(
+                f"{path} has {len(packets)} packets, from which {len(order)} frames are decoded. Copy it again from its "
+                f"source, or leave it out."
+            )
         dts = _increasing(dts)
         delay = max(dts[position] - dts[rank] for rank, position in enumerate(order))
         pts = [stamp for _, stamp in sorted((position, dts[rank] + delay) for rank, position in enumerate(order))]
@@ -316,8 +321,12 @@ def _video_stream(path: Path, container: Any) -> Any:
 
 
 def _read_video_format(path: Path, video: Any) -> VideoFormat:
-    """Return the format of a file's video stream. Raises `TacpipeError` if the file does not state its size."""
+    """Return the format of a file's video stream. Raises `TacpipeError` without a known codec or the size of frames."""
     context = video.codec_context
+    if context is None:
+        raise TacpipeError(
+            f"{path} has a video of a codec that cannot be decoded. Copy it again from its source, or leave it out."
+        )
     if not (context.width and context.height and video.time_base):
         raise TacpipeError(
             f"{path} does not state the size of its frames. Copy it again from its source, or leave it out."
