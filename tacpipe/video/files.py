@@ -100,11 +100,6 @@ def scan(path: Path) -> VideoScan:
     pts, dts, is_key_frame, sizes = (list(column) for column in zip(*packets, strict=True))
     if None in pts or len(set(pts)) < len(pts) or (delayed and DEMUXERS[path.suffix.lower()] in WITHOUT_PTS):
         order = _presentation_order(path, video_format) if delayed else list(range(len(packets)))
-        if len(order) > len(packets):
-            raise TacpipeError(
-                f"{path} has {len(packets)} packets, from which {len(order)} frames are decoded. Copy it again from its "
-                f"source, or leave it out."
-            )
         dts = _increasing(dts)
         delay = max(dts[position] - dts[rank] for rank, position in enumerate(order))
         pts = [stamp for _, stamp in sorted((position, dts[rank] + delay) for rank, position in enumerate(order))]
@@ -342,7 +337,10 @@ def _read_video_format(path: Path, video: Any) -> VideoFormat:
 
 
 def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
-    """Return the file positions of frames in presentation order, found by decoding; those never presented follow."""
+    """Return the file positions of frames in presentation order, found by decoding; those never presented follow.
+
+    Raises `TacpipeError` if several frames are decoded from one packet.
+    """
     order: list[int] = []
     position = 0
     with _open_input(path) as container:
@@ -353,6 +351,10 @@ def _presentation_order(path: Path, video_format: VideoFormat) -> list[int]:
                 position += 1
                 order += [int(frame.pts) for frame in decoder.decode(packet)]
         order += [int(frame.pts) for frame in decoder.decode(None)]
+    if len(set(order)) < len(order):
+        raise TacpipeError(
+            f"{path} has a packet from which several frames are decoded. Copy it again from its source, or leave it out."
+        )
     return order + sorted(set(range(position)) - set(order))
 
 

@@ -94,15 +94,10 @@ class Replay:
 
 
 def _repeatable(returned: Any) -> Callable[[], Any]:
-    """Return a function that returns a result again, whose files and streams of a stage can be consumed only once."""
+    """Return a function that returns the result of a stage anew: its streams and written files can be consumed once."""
     if isinstance(returned, RecordingOutput):
-        streams = {
-            name: (stream, None) if isinstance(stream, pa.Table) else (stream.schema, list(stream))
-            for name, stream in returned.streams.items()
-        }
-        return lambda: dataclasses.replace(
-            returned, tables={name: _stream(*content) for name, content in streams.items()}
-        )
+        streams = {name: _repeatable_stream(stream) for name, stream in returned.streams.items()}
+        return lambda: dataclasses.replace(returned, tables={name: stream() for name, stream in streams.items()})
     if not isinstance(returned, Result) or not returned.written:
         return lambda: returned
     contents = {}
@@ -115,9 +110,11 @@ def _repeatable(returned: Any) -> Callable[[], Any]:
     return lambda: repeatable
 
 
-def _stream(content: Any, batches: list[pa.RecordBatch] | None) -> pa.Table | pa.RecordBatchReader:
-    """Return a table, or a reader that yields the ``batches`` of a schema."""
-    return content if batches is None else pa.RecordBatchReader.from_batches(content, batches)
+def _repeatable_stream(stream: pa.Table | pa.RecordBatchReader) -> Callable[[], pa.Table | pa.RecordBatchReader]:
+    """Return a function that returns the table, or a new reader of the same batches."""
+    if isinstance(stream, pa.Table):
+        return lambda: stream
+    return functools.partial(pa.RecordBatchReader.from_batches, stream.schema, list(stream))
 
 
 def _write(content: bytes, sink: Any) -> None:

@@ -186,12 +186,7 @@ def test_what_follows_a_packet_in_memory_does_not_change_its_image(
 
 
 def test_a_video_of_an_unknown_codec_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.avi"
-    with av.open(str(path), "w") as container:
-        video = container.add_stream("mjpeg", rate=10)
-        video.width, video.height, video.pix_fmt = 64, 48, "yuvj420p"
-        image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
-        container.mux([*video.encode(image), *video.encode()])
+    path = videos.write(tmp_path / "a.avi", "mjpeg", 3)
     path.write_bytes(path.read_bytes().replace(b"MJPG", b"ZZZZ"))
     with pytest.raises(TacpipeError, match=r"a\.avi has a video of a codec that cannot be decoded"):
         files.scan(path)
