@@ -147,7 +147,7 @@ INPUTS = (
     "simulate material --trials 2 -o data/touched",
     "segment slides data/touched -o data/slides",
     "split data/slides -o data/slides-split --scheme random",
-    "simulate touch --trials 4 -o data/pinched",
+    "simulate touch --trials 5 --families box --objects 1 -o data/pinched",
     "segment grasps data/pinched -o data/grasps",
     "split data/grasps -o data/grasps-split --scheme random",
     "store push elsewhere data/split",

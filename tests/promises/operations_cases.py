@@ -179,9 +179,11 @@ def _cases_of_chain(chain: str, names: dict[int, str]) -> list[Case]:
     return [Case(name, CHAINS[chain][number], CHAINS[chain][:number]) for number, name in names.items()]
 
 
-def _export(names: Sequence[str], dataset: str, before: int) -> list[Case]:
-    """Return cases that export a dataset of the chain, made by its first commands."""
-    chain = CHAINS["two forward"][:before]
+EVEN = (CHAINS["two forward"][0], "synchronize data/r -o data/even --rate-hz 50")
+
+
+def _export(names: Sequence[str], dataset: str, chain: tuple[str, ...]) -> list[Case]:
+    """Return cases that export a dataset, which the commands of the chain write."""
     return [
         Case(f"export.{name}", f"export {name} {dataset} -o data/out{' --license mit' * (name == 'card')}", chain)
         for name in names
@@ -270,7 +272,7 @@ STAGES = (
         ("ingest gelsight-slip src -o data/gels",),
         sources=lambda lab: _publish("gelsight-slip", lab / "src"),
     ),
-    Case("segment.slips", "segment slips data/c -o data/slips", CHAINS["two forward"][:3]),
+    Case("segment.slips", "segment slips data/even -o data/slips", EVEN),
     Case("segment.losses", "segment losses data/r -o data/losses --streams xela*", HELD[:2]),
     Case(
         "train.slip",
@@ -286,8 +288,8 @@ STAGES = (
     Case("calibrate", "calibrate models/f data/c --split data/split -o models/g", FORWARD[:5]),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
     Case("report", "report results/f -o report.html", FORWARD),
-    *_export(("card", "csv", "hdf5", "mcap"), "data/r", 1),
-    *_export(("lerobot", "zarr"), "data/synced", 2),
+    *_export(("card", "csv", "hdf5", "mcap"), "data/r", EVEN[:1]),
+    *_export(("lerobot", "zarr"), "data/even", EVEN),
     *(
         _ingest(name)
         for name in ("biotac-slide", "gelsight-slip", "roboskin", "table", "vision2tactile", "xela-flat", "xela-psc")
