@@ -12,6 +12,7 @@ import argparse
 import importlib
 import os
 import platform
+import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -46,7 +47,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="tacpipe-bench-") as folder:
         for name in chosen.only:
             print(f"{name} …", file=sys.stderr, flush=True)
-            lines += importlib.import_module(name).measure(Path(folder), chosen.rounds)
+            place = Path(folder) / name
+            place.mkdir()
+            lines += importlib.import_module(name).measure(place, chosen.rounds)
+            shutil.rmtree(place)
     text = table(lines)
     print(text)
     if set(chosen.only) == set(MODULES):
