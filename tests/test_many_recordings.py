@@ -11,7 +11,7 @@ SIMULATE = "simulate forward --duration-s 20 --robot-rate-hz 50 --jobs 1 -o rec"
 LITTLE = {  # Ten recordings have more than these bytes, which may stay in memory.
     "tacpipe.tasks.forward.evaluation.KEPT_BYTES": 1 << 20,
     "tacpipe.tasks.forward.prediction.KEPT_BYTES": 1 << 20,
-    "tacpipe.tasks.forward.training.IN_MEMORY": 1 << 20,
+    "tacpipe.tasks.forward.tracks.IN_MEMORY": 1 << 20,
     "tacpipe.tasks.forward.training.CALIBRATED": 256,  # windows: of a hundred recordings there are more than of ten
     "tacpipe.tasks.forward.training.LINEAR": 256,
     "tacpipe.io.spill.SEGMENT_BYTES": 1 << 22,

@@ -8,7 +8,6 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +136,7 @@ def guard() -> None:
         sys.meta_path.insert(0, _Guard())
 
 
-class _Guard(MetaPathFinder):
+class _Guard:
     """Finds no modules, but raises `ShortageError` for a library that there is no room for."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> None:

@@ -172,20 +172,19 @@ class _Drawn:
     def __init__(self, forecaster: Forecaster, track: Track) -> None:
         """Draw the channel of ``track`` whose signal varies most, `STEP` steps ahead or at the model's last step."""
         self._step = min(STEP, forecaster.horizon)
-        self._channel = (
-            int(np.argmax(track.tactile[np.flatnonzero(track.usable)].std(axis=0))) if len(track.t_ns) else 0
-        )
+        self._channel = int(np.argmax(tracks.variances(track))) if track.usable.any() else 0
         self._about = {"recording": track.name, "channel": forecaster.codec.channels[self._channel], "step": self._step}
         self._t_ns, self._rows = track.t_ns, list[tuple[Any, ...]]()
 
     def add(self, now: Int64s, truth: AnyFloats, predicted: AnyFloats) -> None:
-        """Add the values of some windows."""
-        at = (slice(None), self._step - 1, self._channel)
+        """Add the values of some windows, up to `MAX_ROWS`."""
+        now = now[: MAX_ROWS - len(self._rows)]
+        at = (slice(len(now)), self._step - 1, self._channel)
         self._rows += zip(self._t_ns[now + self._step] / 1e9, truth[at], *predicted[at].T, strict=True)
 
     def example(self, percents: Sequence[int]) -> dict[str, str | int | list[float]]:
         """Return recording, channel and step, and the curves: time in s, measured values, and each quantile."""
-        columns = np.array(self._rows[:MAX_ROWS]).T
+        columns = np.array(self._rows).T
         names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
         return {
             **self._about,

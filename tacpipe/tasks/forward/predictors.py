@@ -63,6 +63,7 @@ def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
     track = replace(track, arm=tracks.align_quaternions(track.arm, forecaster.orientation))
     for first in range(0, len(starts), CHUNK):
         yield _forecast(forecaster, track, starts[first : first + CHUNK])
+        track.storage.release()
 
 
 def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowForecast:

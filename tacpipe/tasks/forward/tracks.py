@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 BLOCK_ROWS = 1 << 14  # rows per block
+IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk
 _EXACT_BITS = 16  # bits of an integer that float32 represents exactly
 
 
@@ -135,6 +136,7 @@ class Track:
     object: str | None = None  # grasped object, if it is labelled
     # (time, 6), velocities of a plan with these poses; None: the velocities in ``arm``
     plan_velocity: AnyFloats | None = None
+    storage: MappedArrays = field(default_factory=lambda: MappedArrays(sys.maxsize))  # contains the rows
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
         """Return the first row of each window of ``context + horizon`` rows (window,)."""
@@ -165,6 +167,21 @@ class Track:
         same = np.concatenate([[0], np.cumsum(np.diff(self.contact) != 0)])[: len(self.contact)]
         groups = self.groups * (int(same.max(initial=0)) + 1) + same
         return window_starts(groups, self.usable & (self.contact >= 0), context, horizon, stride)
+
+
+def variances(track: Track) -> AnyFloats:
+    """Return the variance of each tactile channel over the usable rows (channel,), in squared counts."""
+    usable = np.flatnonzero(track.usable)
+    blocks = [usable[first : first + BLOCK_ROWS] for first in range(0, len(usable), BLOCK_ROWS)]
+
+    def levels() -> Iterator[AnyFloats]:
+        for block in blocks:
+            yield np.asarray(track.tactile[block])
+            track.storage.release()
+
+    mean = sum(block.sum(axis=0) for block in levels()) / len(usable)
+    variance: AnyFloats = sum(((block - mean) ** 2).sum(axis=0) for block in levels()) / len(usable)
+    return variance
 
 
 def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -> TacpipeError:
@@ -247,12 +264,12 @@ def track(
 ) -> Track:
     """Return a recording's track, with its stored latents, or its channels if ``codec`` is raw.
 
-    ``storage`` keeps the rows, by default in memory. ``pose`` contains the names of the arm's columns. Without a position
-    the arm does not move, and without a quaternion it does not turn. Rows with a value that is not finite or in a gap of
-    any stream are unusable. Raises `TacpipeError` with the recording's name if a column is absent or its channels are not
-    the codec's.
+    ``storage`` contains the rows, by default up to `IN_MEMORY` in memory and others on disk. ``pose`` contains the names
+    of the arm's columns. Without a position the arm does not move, and without a quaternion it does not turn. Rows
+    with a value that is not finite or in a gap of any stream are unusable. Raises `TacpipeError` with the recording's
+    name if a column is absent or its channels are not the codec's.
     """
-    table, storage = shard.columns(), storage or MappedArrays(sys.maxsize)
+    table, storage = shard.columns(), storage or MappedArrays(IN_MEMORY)
     try:
         codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
         counts_above_rest = above_rest(table, codec.channels, storage)
@@ -260,10 +277,7 @@ def track(
         if codec.kind == "raw":
             latent: AnyFloats | Levels = counts_above_rest.astype(np.float32)
         else:
-            read = inputs(table, codec.latents)
-            finite &= np.isfinite(read).all(axis=1)
-            latent = storage.keep(read.astype(np.float32))
-            del read
+            latent = _stored_latents(table, codec.latents, finite, storage)
         _check_inputs(table.schema, pose.columns)
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         arm, plan_velocity = _motion(table, pose, storage)
@@ -289,7 +303,26 @@ def track(
         timeline,
         None if labelled_object is None else str(labelled_object),
         plan_velocity,
+        storage,
     )
+
+
+def _stored_latents(table: Columns, names: Sequence[str], finite: Bools, storage: MappedArrays) -> AnyFloats:
+    """Return the latents (time, latent), float32, in ``storage``; ``finite`` (time,) becomes False for other values.
+
+    Raises the errors of `inputs`.
+    """
+    _check_inputs(table.schema, names)
+    stored = storage.empty((table.num_rows, len(names)), np.float32)
+    first = 0
+    for batch in table.batches(list(names)):
+        rows = slice(first, first + batch.num_rows)
+        values = inputs(batch, names)
+        finite[rows] &= np.isfinite(values).all(axis=1)
+        stored[rows] = values
+        storage.read(stored[rows].nbytes)
+        first = rows.stop
+    return stored
 
 
 def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloats, AnyFloats | None]:

@@ -61,7 +61,6 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost all rows are used
-IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk
 LINEAR = 20_000  # windows for fitting the linear baselines
 SHRINKING = 3000  # maximum number of evenly spaced validation windows for fitting the weights of the forecast
 
@@ -92,7 +91,7 @@ def train(
     if init and start:
         _check_start(start, init, params, codec, training.files)
         _check_pose(start, pose)
-    mapped = MappedArrays(IN_MEMORY)
+    mapped = MappedArrays(tracks.IN_MEMORY)
     parts = [
         [tracks.track(shard, codec, pose, mapped) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)

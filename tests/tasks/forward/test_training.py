@@ -15,8 +15,13 @@ from tacpipe.io import spill
 from tacpipe.io.columns import Columns
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
-from tacpipe.tasks.forward import networks, training
+from tacpipe.plugins.stage import Result
+from tacpipe.tasks.forward import networks, tracks, training
 from tacpipe.tasks.forward import training as forward_training
+from tacpipe.tasks.forward.calibration import calibrate
+from tacpipe.tasks.forward.evaluation import evaluate
+from tacpipe.tasks.forward.prediction import predict
+from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, evaluated, params, trained
@@ -51,30 +56,40 @@ def test_a_tiny_deterministic_set_is_learned_by_heart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("latents", [False, True])
-def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
+def test_recordings_on_disk_give_the_same_model_evaluation_and_predictions_as_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latents: bool
 ) -> None:
-    shards = [*TRAIN, *VAL]
+    shards = [*TRAIN, *VAL, *(motion(seed) for seed in range(70, 75))]
     recordings = compressed(*shards) if latents else dataset(*shards)
-    train, val = ([shard.name for shard in part] for part in (TRAIN, VAL))
 
-    def model(folder: str) -> dict[str, bytes]:
-        parts = (
-            dataset(*(recordings.recordings[name] for name in names), files=dict(recordings.files))
-            for names in (train, val)
-        )
+    def part(*names: str) -> Any:
+        return dataset(*(recordings.recordings[name] for name in names), files=dict(recordings.files))
+
+    def results(folder: str) -> tuple[dict[str, bytes], dict[str, bytes], list[pa.Table]]:
         (tmp_path / folder).mkdir()
-        return trained(tmp_path / folder, *parts)
+        names = [shard.name for shard in shards]
+        first_val, first_calibration = len(TRAIN), len(TRAIN) + len(VAL)
+        train, val = part(*names[:first_val]), part(*names[first_val:first_calibration])
+        request = CalibrationRequest((10, 50, 90), False, 0.05, 0)
+        model = calibrate(trained(tmp_path / folder, train, val), request, train, part(*names[first_calibration:-1]))
+        evaluation = evaluate(model, part(names[-1]))
+        prediction = predict(model, part(names[-1]), [1, 3], [10, 90])
+        return model, dict(evaluation.files), [_rows(result) for result in (evaluation, prediction)]
 
-    in_memory = model("in-memory")
-    monkeypatch.setattr(training, "IN_MEMORY", 0)
-    for module in (training, networks):
+    in_memory = results("in-memory")
+    monkeypatch.setattr(tracks, "IN_MEMORY", 0)
+    for module in (training, networks, tracks):
         monkeypatch.setattr(module, "BLOCK_ROWS", 7)
     monkeypatch.setattr(networks, "WINDOWS", 5)
     monkeypatch.setattr(Columns.batches, "__defaults__", (None, 7))
     monkeypatch.setattr(spill, "SEGMENT_BYTES", 1 << 14)
     monkeypatch.setattr(spill, "MAX_READ_BYTES", 0)
-    assert model("on-disk") == in_memory
+    assert results("on-disk") == in_memory
+
+
+def _rows(result: Result) -> pa.Table:
+    (output,) = result.recordings.values()
+    return output.streams[""]
 
 
 @pytest.mark.parametrize("architecture", registry.architectures("forward"))
