@@ -6,7 +6,8 @@ What is shown depends on the contents of the dataset, not on the stage that crea
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
@@ -108,11 +109,11 @@ def of(path: Path, *, most: int | None = None) -> Shown:
         }
     attributes: Mapping[str, Mapping[str, Attribute]] = RecordingAttributes(opened)
     if most is None:
-        attributes = {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
+        attributes = {name: dict(labels) for name, labels in attributes.items()}
     return {
         "kind": "recordings",
         **about,
-        "recordings": _figures(opened, sorted(opened.recordings)[:most], None if most is None else READ_BYTES),
+        "recordings": _figures(opened, list(islice(opened.recordings, most)), None if most is None else READ_BYTES),
         "attributes": attributes,
         "excluded": _exclusion_reasons(opened),
     }
@@ -207,9 +208,11 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
         lines.append(
             f"{format_count(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full"
         )
-    lines += ["", *_labels(value["attributes"], full)]
+    labels = _Labels()
+    incomplete = spool_folders.describe_incomplete(labels.counting(value["attributes"].items()), value["recordings"])
+    lines += ["", *labels.lines(full)]
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
-    lines += spool_folders.describe_incomplete(value["attributes"], value["recordings"])
+    lines += incomplete
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
     lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(
@@ -255,19 +258,32 @@ class _Values:
         return ", ".join(f"{value} ({count})" for value, count in sorted(self._counts.items()))
 
 
-def _labels(attributes: Mapping[str, Mapping[str, Attribute]], full: bool) -> list[str]:
-    """Return one line per label with its values; unless ``full``, a single line for all ground-truth labels."""
-    lines = []
-    values_by_label: dict[str, _Values] = {}
-    for labels in attributes.values():
-        for label, value in labels.items():
-            values_by_label.setdefault(label, _Values()).add(value)
-    names = sorted(values_by_label)
-    truth = [name for name in names if name.startswith(_TRUTH)]
-    if truth and not full:
-        names = [name for name in names if name not in truth]
-        lines.append(
-            f"{_TRUTH}*: {format_count(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
-        )
-    lines += [f"{label}: {values_by_label[label]}" for label in names]
-    return lines
+class _Labels:
+    """Summary of the labels of recordings."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, _Values] = {}  # by label
+
+    def counting(
+        self, recordings: Iterable[tuple[str, Mapping[str, Attribute]]]
+    ) -> Iterator[tuple[str, Mapping[str, Attribute]]]:
+        """Yield names and labels of recordings as they are, and add the labels to the summary."""
+        for name, labels in recordings:
+            for label, value in labels.items():
+                if label not in self._values:
+                    self._values[label] = _Values()
+                self._values[label].add(value)
+            yield name, labels
+
+    def lines(self, full: bool) -> list[str]:
+        """Return one line per label with its values; unless ``full``, a single line for all ground-truth labels."""
+        lines = []
+        names = sorted(self._values)
+        truth = [name for name in names if name.startswith(_TRUTH)]
+        if truth and not full:
+            names = [name for name in names if name not in truth]
+            lines.append(
+                f"{_TRUTH}*: {format_count(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
+            )
+        lines += [f"{label}: {self._values[label]}" for label in names]
+        return lines

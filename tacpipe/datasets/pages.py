@@ -11,7 +11,7 @@ import contextlib
 import json
 import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, ItemsView, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -423,11 +423,25 @@ class _View(Mapping[str, V]):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.pages,)
 
+    def items(self) -> ItemsView[str, V]:
+        """Return names and fields, of which each page is loaded once."""
+        return _ViewItems(self)
+
     def parts(self) -> Iterator[Mapping[str, V]]:
         """Yield the content page by page."""
         for number, page in enumerate(self.pages.pages):
             if getattr(page, self.count):
                 yield getattr(self.pages.load(number), self.part)
+
+
+class _ViewItems(ItemsView[str, V]):
+    """Names and fields of the recordings in pages, page by page."""
+
+    _mapping: _View[V]
+
+    def __iter__(self) -> Iterator[tuple[str, V]]:
+        for part in self._mapping.parts():
+            yield from part.items()
 
 
 class Recordings(_View[RecordingEntry]):

@@ -6,11 +6,12 @@ are shown only next to results on its data; a lab's own recordings are not marke
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, ItemsView, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.streams import TRUTH
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
@@ -136,16 +137,33 @@ class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
     """The attributes of each recording, sorted by name; for a large dataset they are read on access."""
 
     def __init__(self, dataset: Dataset) -> None:
-        self._recordings = dataset.recordings
+        included = dataset.source.included
+        is_large = isinstance(included, pages.Recordings) and len(included) == len(dataset)
+        self._entries = included if is_large else {name: included[name] for name in dataset.recordings}
 
     def __getitem__(self, name: str) -> Mapping[str, Attribute]:
-        return self._recordings[name].attributes
+        return self._entries[name]["attributes"]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._recordings)
+        return iter(self._entries)
 
     def __len__(self) -> int:
-        return len(self._recordings)
+        return len(self._entries)
+
+    def items(self) -> ItemsView[str, Mapping[str, Attribute]]:
+        """Return names and attributes, of which each page of a manifest is loaded once."""
+        return _AttributeItems(self)
+
+    def pairs(self) -> Iterator[tuple[str, Mapping[str, Attribute]]]:
+        """Yield each recording's name and attributes."""
+        return ((name, entry["attributes"]) for name, entry in self._entries.items())
+
+
+class _AttributeItems(ItemsView[str, Mapping[str, Attribute]]):
+    _mapping: RecordingAttributes
+
+    def __iter__(self) -> Iterator[tuple[str, Mapping[str, Attribute]]]:
+        return self._mapping.pairs()
 
 
 PUBLISHED, SIMULATED = "published", "simulated"

@@ -263,15 +263,14 @@ class StreamDuration(TypedDict, total=False):
 
 
 def describe_incomplete(
-    attributes: Mapping[str, Mapping[str, Attribute]], recordings: Mapping[str, Mapping[str, StreamDuration]]
+    attributes: Iterable[tuple[str, Mapping[str, Attribute]]], recordings: Mapping[str, Mapping[str, StreamDuration]]
 ) -> list[str]:
     """Return one line per incomplete recording, and one per recording with uncertain arrival times.
 
-    ``attributes`` has the attributes of each recording, ``recordings`` the figures of its streams.
+    ``attributes`` has the name and the attributes of each recording, ``recordings`` the figures of its streams by name.
     """
     lines = []
-    for name in sorted(attributes):
-        values = attributes[name]
+    for name, values in attributes:
         if (ended := values.get("ended")) in REASONS:
             figures = recordings.get(name, {}).values()
             durations_s = [stream["duration_s"] for stream in figures if "duration_s" in stream]
