@@ -24,7 +24,7 @@ from tacpipe.cli import main
 from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Manifest, find
 from tacpipe.engine import provenance
-from tacpipe.io import memory
+from tacpipe.io import memory, terminal
 from tacpipe.plugins import architectures, registry
 from tacpipe.store.store import Store
 
@@ -130,6 +130,12 @@ class FileCalls:
 
 
 _traced: list[FileCalls] = []
+
+
+@pytest.fixture(autouse=True)
+def _visible_notes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Undo ``--quiet`` of commands that earlier tests ran in this process."""
+    monkeypatch.setattr(terminal, "_quiet", False)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets import paths, selection
 from tacpipe.datasets.dataset import Dataset, Reader, Recording
@@ -30,7 +30,9 @@ from tacpipe.store import records
 from tacpipe.store.location import open_store
 from tacpipe.store.records import Provenance, RecordingEntry, Shard, StageIdentity, StoredResult
 from tacpipe.store.store import MissingError, Object, Store
-from tacpipe.training import display, following
+
+if TYPE_CHECKING:
+    from tacpipe.training import following
 
 _MAX_MESSAGE_BYTES = 1 << 20  # maximum length of an error message
 
@@ -361,6 +363,8 @@ def _follow_training(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -
     if workspace is None:
         yield
         return
+    from tacpipe.training import display, following
+
     with (
         display.followers_on_stderr(registry.stage_name(name), workspace) as displays,
         following.in_workspace(workspace, *displays),
@@ -374,6 +378,8 @@ def watching(task: WorkerTask) -> Iterator[Sequence[following.Follower]]:
     if registry.load_step(task.name).argument("Workspace") is None:
         yield ()
         return
+    from tacpipe.training import display, following
+
     store = open_store(task.store)
     # the workspace of a remote store is in the worker's folder
     local_workspace = None if store.distant else workspace(store, digest(task.identity))

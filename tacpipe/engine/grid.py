@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tacpipe.engine import pipeline, provenance
 from tacpipe.engine.executors.local import Local
@@ -19,8 +20,9 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.store.location import locate
-from tacpipe.training import display, following
-from tacpipe.training.following import Line, TrainedNetwork
+
+if TYPE_CHECKING:
+    from tacpipe.training.following import Line, TrainedNetwork
 
 PLACE = "{fold}"  # placeholder for the fold's number in paths
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?")
@@ -106,6 +108,8 @@ class DurationEstimate:
 
     def __str__(self) -> str:
         """Return the estimate as a sentence."""
+        from tacpipe.training import display
+
         noun = "model" if self.models == 1 else "models"
         return (
             f"estimate: {self.models} {noun} to train, {self.at_once} at a time, at most "
@@ -150,7 +154,9 @@ def _is_missing(request: Request) -> bool:
 
 def _measure_duration(request: Request) -> float | None:
     """Run a training until its duration is known, and return that in seconds; None if no network is trained."""
-    stopwatch = _Stopwatch()
+    from tacpipe.training import following
+
+    stopwatch = _Stopwatch(following.TrainedNetwork(1))
     try:
         with following.track_with([stopwatch]):
             pipeline.run(replace(request, executor="local", track=()))
@@ -166,11 +172,11 @@ class _TimedError(Exception):
 class _Stopwatch:
     """Times batches of the first network and then ends its training."""
 
-    def __init__(self) -> None:
+    def __init__(self, network: TrainedNetwork) -> None:
         self.all_s = 0.0  # reading, and all epochs of the other networks
         self._started_s = self._begun_s = time.monotonic()
         self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
-        self._network, self._done = TrainedNetwork(1), 0
+        self._network, self._done = network, 0
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         self._begun_s = time.monotonic()

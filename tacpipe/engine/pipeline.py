@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets import manifest, replacing, selection
 from tacpipe.datasets.dataset import Dataset
@@ -32,9 +32,9 @@ from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import Content, RecordingEntry, RunIdentity, StageIdentity, Step, StoredResult
 from tacpipe.store.store import MissingError, Store
-from tacpipe.trackers import tracking
-from tacpipe.trackers.tracking import Tracker
-from tacpipe.training import following
+
+if TYPE_CHECKING:
+    from tacpipe.trackers.tracking import Tracker
 
 # entry of a recording whose part of the stage returns only files
 _NOTHING: RecordingEntry = {"attributes": {}, "shards": {}}
@@ -58,7 +58,7 @@ def run(request: Request) -> Outcome:
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
     if request.track and (request.check or request.compare):
         raise UsageError("--track follows what is stored; it does not go with --check or --recompute-and-compare.")
-    trackers = tracking.open_trackers(request.track) if request.track else {}
+    trackers = _open_trackers(request.track) if request.track else {}
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
     inputs = RequestInputs(request, store)
@@ -96,6 +96,12 @@ def _conclude(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread
     return outcome
 
 
+def _open_trackers(texts: Sequence[str]) -> dict[str, Tracker]:
+    from tacpipe.trackers import tracking
+
+    return tracking.open_trackers(texts)
+
+
 @contextmanager
 def _track_run(
     request: Request, trackers: dict[str, Tracker], outcome: Outcome, store: Store
@@ -104,6 +110,9 @@ def _track_run(
     if not trackers:
         yield lambda result: None
         return
+    from tacpipe.trackers import tracking
+    from tacpipe.training import following
+
     params = {**params_of.to_json(request.params), "stage": request.name, "fold": request.fold}
     tracked = tracking.Tracking(trackers, tracking.name_of(request.output, outcome.key), tracking.flat_params(params))
 

@@ -13,7 +13,6 @@ from tacpipe.datasets.manifest import VALUES, Found, InputDataset, Manifest
 from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
-from tacpipe.formats import container
 from tacpipe.io import regular
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
@@ -132,6 +131,8 @@ class RequestInputs:
         else:
             command = self.request.name.replace(".", " ")
             reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
+        from tacpipe.formats import container
+
         return container.describe_unread(self.request.source, read_paths, reason, self.request.output)
 
     def plan(self) -> ResultPlan:
