@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fnmatch
 import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from tacpipe.errors import StorageError, UsageError
@@ -80,7 +80,8 @@ def listed(folder: Path, pattern: str = "*") -> list[Path]:
         names = os.listdir(folder)  # noqa: PTH208
     except (FileNotFoundError, NotADirectoryError):
         return []
-    return [folder / name for name in sorted(names) if fnmatchcase(name, pattern)]
+    is_match = re.compile(fnmatch.translate(pattern)).match
+    return [folder / name for name in sorted(filter(is_match, names))]
 
 
 def present(path: Path | str) -> bool:

@@ -246,7 +246,7 @@ class Look:
             new_rows = [self._object_row(name) for _, name, _ in new_files]
             expected |= {path: row[2] for (path, _, _), row in zip(new_files, new_rows, strict=True)}
             inodes = _inodes(self._directory)
-            if any(inodes.get(path) != inode for path, inode in expected.items()):
+            if not expected.items() <= inodes.items():
                 return False
             added = dict(rows_by_shelf({*new_rows, self._object_row(head.manifest)}))
             settled = self._settled_states()
