@@ -30,6 +30,7 @@ from tests.test_garbage import age
 MEMORY = Path("/dev/shm")  # Thousands of folders come and go there quickly.
 PROJECT = Path(__file__).parents[2]
 QUICK = (TOYS[:5], TOYS[5:11], TOYS[11:])
+NO_CALL = 10**6  # number beyond the last call of any command, at which nothing fails
 # Each call of commands that touch the store is tried. Stages make the same calls there, so each third of a stage is tried,
 # starting with the first, the second or the third: together three stages try all that stages do.
 EVERY = {case.name: "1" for case in TOYS} | {case.name: f"{1 + n % PART}/{PART}" for n, case in enumerate(STAGES)}
@@ -62,6 +63,16 @@ def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
 ) -> None:
     (trial,) = run_trials(plugin, tmp_path, name, "--every", EVERY[name])
     assert trial["failed"] * int(EVERY[name].rpartition("/")[2]) > trial["calls"] > 0
+    assert trial["problems"] == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [case.name for case in STAGES])
+def test_each_stage_that_the_faults_try_succeeds_and_survives_a_loss_of_power_at_its_end(
+    name: str, plugin: Path, tmp_path: Path
+) -> None:
+    (trial,) = run_trials(plugin, tmp_path, name, "--every", f"{NO_CALL}/{NO_CALL}")
+    assert 0 < trial["calls"] < NO_CALL
     assert trial["problems"] == []
 
 
