@@ -100,13 +100,13 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     t_ns = from_arrow(columns.column("t_ns"))  # (time,)
     columns.forget()
     loads: list[Floats] = []
-    limits: list[Thresholds] = []
+    thresholds: list[Thresholds] = []
     rest_metadata: dict[str, dict[str, str]] = {}
     schema = columns.schema
     sensors = _tactile_columns(recording.name, schema)
     units = {stream: common_unit(schema, names) for stream, names in sensors.items()}
-    fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
-    _check_levels(params, recording.name, units, fixed)
+    fixed_streams = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
+    _check_levels(params, recording.name, units, fixed_streams)
     for stream, names in sensors.items():
 
         def blocks(names: Sequence[str] = names) -> Iterator[AnyArray]:
@@ -117,31 +117,31 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
         load, repeated = load_in_blocks(blocks, level, axes)
         loads.append(load)
-        if stream in fixed:
-            limits.append(Thresholds(params.on_count, params.off_count))
+        if stream in fixed_streams:
+            thresholds.append(Thresholds(params.on_count, params.off_count))
         else:
-            limits.append(_fixed_thresholds(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
-        zero = tare_level(params.tare, next(blocks()), level, axes)
-        rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
-    stacked = np.array(loads)  # (sensor, time)
+            thresholds.append(_fixed_thresholds(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
+        tare_values = tare_level(params.tare, next(blocks()), level, axes)
+        rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, tare_values, strict=True)}
+    all_loads = np.array(loads)  # (sensor, time)
     loads.clear()
     if params.begins == "grasped":
         intervals = np.array([[0, len(t_ns)]])
     else:
-        on, off = np.array(limits).T
-        intervals = contact_intervals(stacked, t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
-    numbers = np.full(len(t_ns), -1, dtype=np.int32)
+        on, off = np.array(thresholds).T
+        intervals = contact_intervals(all_loads, t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
+    contact_numbers = np.full(len(t_ns), -1, dtype=np.int32)
     for number, (start, stop) in enumerate(intervals):
-        numbers[start:stop] = number
+        contact_numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
-    largest = [float(np.nanmax(load, initial=0.0)) for load in stacked]
-    notes = [] if len(intervals) else [_no_contact_note(params, units, limits, largest, fixed)]
+    max_loads = [float(np.nanmax(load, initial=0.0)) for load in all_loads]
+    notes = [] if len(intervals) else [_no_contact_note(params, units, thresholds, max_loads, fixed_streams)]
 
-    def mark(table: pa.Table, first: int) -> pa.Table:
-        contact = to_arrow(numbers[first : first + table.num_rows])
+    def add_contact(table: pa.Table, first: int) -> pa.Table:
+        contact = to_arrow(contact_numbers[first : first + table.num_rows])
         return with_metadata(table.append_column(field, contact), rest_metadata)
 
-    return RecordingOutput(change(columns, mark), _threshold_attributes(units, limits, fixed), notes)
+    return RecordingOutput(change(columns, add_contact), _threshold_attributes(units, thresholds, fixed_streams), notes)
 
 
 def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:

@@ -105,7 +105,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
 
 
 def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the reading after both fingers closed, as one row, and the time when both first touched, in ns.
+    """Return the settled reading of both fingers, as one row, and the time in ns at which both first touched.
 
     Raises `TacpipeError` if columns or values are missing, or the fingers never press or settle.
     """

@@ -81,7 +81,7 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
     )
     touch = loss_of_contact(list(touches.values()), limits)
 
-    def labelled(stream: str, table: pa.Table) -> pa.Table:
+    def add_labels(stream: str, table: pa.Table) -> pa.Table:
         t_ns: Times = table["t_ns"].to_numpy()
         rows = np.clip(np.searchsorted(touch.t_ns, t_ns, side="right") - 1, 0, len(touch.t_ns) - 1)
         contact = np.where(touch.touched[rows], 0, -1).astype(np.int8)
@@ -100,7 +100,7 @@ def losses(params: Params, recording: Recording) -> RecordingOutput:
         return table
 
     return RecordingOutput(
-        {name: labelled(name, table) if name in touches else table for name, table in tables.items()}
+        {name: add_labels(name, table) if name in touches else table for name, table in tables.items()}
     )
 
 

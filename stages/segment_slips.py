@@ -115,13 +115,13 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
         labels["slip_online"][rows] = is_held & ~lost_online & is_slipping
     label = {"unit": "1", "quantity": "label"}
 
-    def mark(rows: pa.Table, first: int) -> pa.Table:
-        for name, marks in labels.items():
-            values = pa.array(marks[first : first + rows.num_rows].astype(np.int8))
+    def add_labels(rows: pa.Table, first: int) -> pa.Table:
+        for name, flags in labels.items():
+            values = pa.array(flags[first : first + rows.num_rows].astype(np.int8))
             rows = rows.append_column(pa.field(name, pa.int8(), metadata=label), values)
         return rows
 
-    return change(table, mark)
+    return change(table, add_labels)
 
 
 def _proximity(name: str, channel: str, table: Columns) -> str:

@@ -105,15 +105,15 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     hold_values = params.values == "hold"
     clock = "arrival" if hold_values else params.clock
     storage = MappedArrays(IN_MEMORY)
-    placed = {
+    timed_streams = {
         name: streams.to_host_clock(recording.name, name, columns, clock, storage)
         for name, columns in signal_streams.items()
     }
     master_name = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in signal_streams.items()}
-    master = placed[streams.master(recording.name, master_name, schemas)]
+    master = timed_streams[streams.master(recording.name, master_name, schemas)]
     grid_ns, rows = streams.grid(
-        recording.name, params.timeline, params.rate_hz, placed, master, storage, hold_values=hold_values
+        recording.name, params.timeline, params.rate_hz, timed_streams, master, storage, hold_values=hold_values
     )
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if omitted := [name for name in recorded_streams if name not in signal_streams]:
@@ -125,7 +125,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     ahead_ns[:] = 0
     gaps: dict[str, pa.Array] = {}  # masks (grid,) by name
     readers: list[GridColumns] = []
-    for name, stream in placed.items():
+    for name, stream in timed_streams.items():
         exact = None if hold_values else streams.rows_at(stream.t_ns, grid_ns, rows, storage)
         if params.unwrap:
             stream = streams.unwrap_counts(stream)
@@ -146,15 +146,15 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     times = master.columns.schema.field("t_ns")
 
     def batches() -> Iterator[pa.RecordBatch]:
-        for points in grid_ranges(grid_ns, list(placed.values()), BLOCK_BYTES):
+        for points in grid_ranges(grid_ns, list(timed_streams.values()), BLOCK_BYTES):
             columns = [(times, grid_ns[points]), *(column for reader in readers for column in reader.read(points))]
             arrays = [to_arrow(values, kind.type) if hasattr(values, "dtype") else values for kind, values in columns]
             yield pa.RecordBatch.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
             storage.release()
 
-    following = batches()
-    first, second = next(following), next(following, None)
+    remaining = batches()
+    first, second = next(remaining), next(remaining, None)
     result = pa.Table.from_batches([first])
     if second is not None:
-        result = pa.RecordBatchReader.from_batches(first.schema, chain([first, second], following))
+        result = pa.RecordBatchReader.from_batches(first.schema, chain([first, second], remaining))
     return RecordingOutput(result, attributes, masks.describe_gaps(pa.Table.from_pydict(gaps)))

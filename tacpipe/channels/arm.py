@@ -77,11 +77,11 @@ DEFAULT_POSE = Pose(
 
 
 def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
-    """Return the pose columns of the arm, empty if no column has the quantity position.
+    """Return the pose columns of the arm, or an empty pose if no column has the quantity position.
 
-    ``arm`` names the stream of the arm. By default it is the only stream with a position, or the stream robot. Raises
-    `UsageError` if ``arm`` has no position, and `TacpipeError` if several streams have a position or its components are
-    not x, y and z. If the arm is neither ``needed`` nor named, such streams, for example of markers, are ignored.
+    ``arm`` is the stream of the arm; by default the only stream with a position, or the stream robot. Raises `UsageError`
+    if ``arm`` has no position, and `TacpipeError` if the arm is ambiguous or its components are not x, y and z. Unless
+    ``needed`` or ``arm`` is set, an ambiguous or incomplete position, such as of markers, gives an empty pose instead.
     """
     vectors = _vectors(schema, POSITION)
     if not vectors and set(DEFAULT_POSE.columns) <= set(schema.names):
@@ -92,7 +92,7 @@ def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
     if not vectors:
         return Pose()
     stream = arm or (streams[0] if len(streams) == 1 else DEFAULT_STREAM)
-    candidates = [fields for (owner, _), fields in vectors.items() if owner == stream]
+    candidates = [fields for (vector_stream, _), fields in vectors.items() if vector_stream == stream]
     if not candidates and not needed:
         return Pose()
     if len(candidates) != 1:
@@ -107,7 +107,9 @@ def pose(schema: pa.Schema, arm: str = "", *, needed: bool = True) -> Pose:
         position = _order_components(candidates[0], "xyz", POSITION, stream)
     except TacpipeError as error:
         raise TacpipeError(f"{error} {NO_ARM_HINT}") from error
-    orientations = [fields for (owner, _), fields in _vectors(schema, ORIENTATION).items() if owner == stream]
+    orientations = [
+        fields for (vector_stream, _), fields in _vectors(schema, ORIENTATION).items() if vector_stream == stream
+    ]
     if len(orientations) > 1:
         names = listed(field.name for fields in orientations for field in fields)
         raise TacpipeError(

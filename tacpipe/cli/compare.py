@@ -143,18 +143,19 @@ class Compared:
 
     def to_csv(self) -> str:
         """Return a CSV with one line per predictor and question, and a column for each setting and error."""
-        lines = []
+        records = []
         for comparison in self.to_json()["comparisons"]:
             question = {name: comparison[name] for name in ("task", "part", "target", "measure")}
             for row in comparison["rows"]:
                 values = {name: value for name, value in row.items() if name not in ("settings", "errors", "results")}
-                lines.append(
+                records.append(
                     {**question, **values, **row["settings"], **row["errors"], "results": " ".join(row["results"])}
                 )
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(dict.fromkeys(name for line in lines for name in line)), lineterminator="\n")
+        heads = list(dict.fromkeys(name for record in records for name in record))
+        writer = csv.DictWriter(text, heads, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(lines)
+        writer.writerows(records)
         return text.getvalue().rstrip("\n")
 
     def tables(self) -> list[TerminalTable]:

@@ -71,10 +71,9 @@ class PanelCommand(TyperCommand):
         options = {name for param in self.params for name in (*param.opts, *param.secondary_opts)}
         renamed = {old: new for old, new in OLD_NAMES.items() if new in options and old not in options}
         end = args.index("--") if "--" in args else len(args)
-        words = [word.partition("=") for word in args[:end]]
-        return super().parse_args(
-            ctx, ["".join((renamed.get(name, name), *value)) for name, *value in words] + args[end:]
-        )
+        parts = [arg.partition("=") for arg in args[:end]]
+        renamed_args = [renamed.get(name, name) + sign + value for name, sign, value in parts]
+        return super().parse_args(ctx, renamed_args + args[end:])
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the usage after the command's name: arguments, required options, and a placeholder for other options."""
@@ -123,17 +122,17 @@ class PanelCommand(TyperCommand):
                 formatter.write_dl([_brief_record(param, ctx) for param in panels[name]])
         optional = [param for name in panels if name not in ("Arguments", REQUIRED) for param in panels[name]]
         rows = [_brief_record(param, ctx) for param in optional]
-        common = [number for name in COMMON for number, param in enumerate(optional) if param.name == name]
-        shown_numbers: set[int] = set()
-        for number in dict.fromkeys([*common, *range(len(optional))]):
+        common = [index for name in COMMON for index, param in enumerate(optional) if param.name == name]
+        selected: set[int] = set()  # indices of the options that fit
+        for candidate in dict.fromkeys([*common, *range(len(optional))]):
             trial = type(formatter)(width=formatter.width, max_width=formatter.width)
-            trial.write_dl([rows[index] for index in sorted({*shown_numbers, number})] if rows else [])
+            trial.write_dl([rows[index] for index in sorted({*selected, candidate})])
             if (formatter.getvalue() + trial.getvalue()).count("\n") > BRIEF_LINES - 4:
                 break
-            shown_numbers.add(number)
+            selected.add(candidate)
         with formatter.section(OPTIONS):
-            formatter.write_dl([rows[number] for number in sorted(shown_numbers)])
-        if hidden := len(optional) - len(shown_numbers):
+            formatter.write_dl([rows[index] for index in sorted(selected)])
+        if hidden := len(optional) - len(selected):
             formatter.write(f"\n{hidden} more {'option' if hidden == 1 else 'options'}: {ctx.command_path} --help\n")
 
 

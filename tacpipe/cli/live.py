@@ -41,9 +41,9 @@ Example: tacpipe live rig.toml --model models/slip --plan udp::9000 --alarms-per
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the command to ``program``, with an option for each setting of every task whose models can run live.
+    """Add the command ``live`` to ``program``, with an option for each setting of every task whose models can run live.
 
-    It raises `UsageError` for a duration that is not above 0.
+    The command raises `UsageError` for a duration that is not above 0.
     """
 
     def live(
@@ -68,20 +68,20 @@ def add(program: typer.Typer, summary: str) -> None:
 
         if duration is not None and duration <= 0:
             raise UsageError("--duration-s must be above 0.")
-        texts = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-        session = preparation.prepare(rigs.read(rig), str(rig), texts)
+        option_texts = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+        session = preparation.prepare(rigs.read(rig), str(rig), option_texts)
         _run(session, output, name, duration, label or [], pictures, quiet=quiet, as_json=as_json)
 
     signature = inspect.signature(live, eval_str=True)
-    fixed = [
+    common_parameters = [
         parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for parameter in signature.parameters.values()
         if parameter.kind != inspect.Parameter.VAR_KEYWORD
     ]
-    complete = signature.replace(parameters=[*fixed, *_options()])
+    full_signature = signature.replace(parameters=[*common_parameters, *_options()])
     function: Any = live
-    function.__signature__ = complete  # Typer reads both the signature and the annotations.
-    function.__annotations__ = {name: parameter.annotation for name, parameter in complete.parameters.items()}
+    function.__signature__ = full_signature  # Typer reads both the signature and the annotations.
+    function.__annotations__ = {name: parameter.annotation for name, parameter in full_signature.parameters.items()}
     program.command("live", help=summary + HELP)(live)
 
 

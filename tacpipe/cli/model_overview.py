@@ -115,7 +115,7 @@ def of_model(opened: Dataset, store: Store) -> ModelOverview:
 def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
     """Return the overview of a result: the model and its baselines, the evaluated data and their role.
 
-    ``found`` is where it was found in ``store``. Raises the errors of `_read_tree`.
+    ``found`` is its manifest in ``store``. Raises the errors of `_read_tree`.
     """
     config, metrics = _read_tree(opened, CONFIG), _read_tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None

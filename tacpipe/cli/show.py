@@ -184,7 +184,7 @@ def to_text(value: Shown, *, full: bool = False) -> str:
 
 
 def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
-    """Return the lines of an overview of recordings: a table of streams, labels, excluded recordings, files, totals."""
+    """Return the lines of an overview of recordings: a table of streams, the labels, excluded recordings, files, totals."""
     listed_names, count = sorted(value["recordings"]), len(value["attributes"])
     lines = [
         f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "

@@ -344,10 +344,10 @@ def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable
     groups = []
     for stream, members in groupby(columns, lambda column: column.stream):
         rows = []
-        for about, alike in groupby(
+        for about, similar in groupby(
             members, lambda column: (column.quantity, column.unit, column.type, full and column.name)
         ):
-            names = [shown(column.name) for column in alike]
+            names = [shown(column.name) for column in similar]
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             rows.append(TerminalRow((text, str(len(names)), *(shown(value) for value in about[:3]))))
         groups.append(RowGroup(shown(stream) or "-", rows))
@@ -364,9 +364,9 @@ def _gaps_text(recording: RecordingOverview, full: bool) -> str:
         )
         total_s = sum(gap.stop_s - gap.start_s for gap in longest)
         share = f" ({total_s / recording.duration_s:.1%})" if recording.duration_s else ""
-        places = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
+        details = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
         lines.append(
-            f"{plain(stream)}: {format_count(len(places), 'gaps')}, {total_s:.3f} s{share}: {_list_first(places, full)}"
+            f"{plain(stream)}: {format_count(len(details), 'gaps')}, {total_s:.3f} s{share}: {_list_first(details, full)}"
         )
     return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
 

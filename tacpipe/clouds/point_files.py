@@ -205,8 +205,9 @@ def _point_dtype(path: Path, lines: dict[str, list[str]]) -> np.dtype[np.void]:
         if width not in sizes:
             declared = f"the field {plain(name)} of TYPE {plain(kind)} and SIZE {plain(size)}"
             raise TacpipeError(f"{path} has {declared}, which do not fit together.")
-        wrong_position = name in POSITION and (letter != "f" or count != 1)
-        if wrong_position or (name in COLOURS and (width != 4 or count != 1)):
+        is_bad_position = name in POSITION and (letter != "f" or count != 1)
+        is_bad_colour = name in COLOURS and (width != 4 or count != 1)
+        if is_bad_position or is_bad_colour:
             expected = "one float (TYPE F)" if name in POSITION else "one number of four bytes (SIZE 4)"
             raise TacpipeError(
                 f"{path} has the field {name} of TYPE {kind}, SIZE {size} and COUNT {count_text}; it must be {expected}."
@@ -337,8 +338,8 @@ def _ply_header(path: Path, content: bytes) -> _Header:
     if end_position < 0 or not length or lines[:1] != [["ply"]]:
         raise TacpipeError(f"{path} is not a PLY file or was cut off: it must start with ply and have a full header.")
     form = next((words[1] for words in lines if words[:1] == ["format"] and len(words) == 3), "")
-    starts = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
-    elements = [lines[start:end_position] for start, end_position in itertools.pairwise([*starts, len(lines)])]
+    element_lines = [number for number, words in enumerate(lines) if words[:1] == ["element"]]
+    elements = [lines[start:end_position] for start, end_position in itertools.pairwise([*element_lines, len(lines)])]
     vertex_index = next(
         (number for number, (declaration, *_) in enumerate(elements) if declaration[1:2] == ["vertex"]), 0
     )

@@ -164,16 +164,16 @@ def _train_network(
     components: int,
     representation: str,
 ) -> loop.TrainingResult:
-    """Train a network that reproduces its inputs, and return its best weights; ``workspace`` keeps it after interruptions.
+    """Train a network that reproduces its inputs, and return its best weights.
 
-    ``position`` and the number of candidates are shown while it trains.
+    Its state is saved in ``workspace``, so that training resumes after an interruption. Progress shows ``position``.
     """
     widths, (index, count) = (train_tensor.shape[1], *network.hidden, components), position
 
     def window_set(rows: Tensor) -> loop.WindowSet:
         def loss(model: nn.Module, indices: Tensor) -> Tensor:
-            picked = rows[indices]
-            return nn.functional.mse_loss(model(picked), picked)
+            batch = rows[indices]
+            return nn.functional.mse_loss(model(batch), batch)
 
         return loop.WindowSet(len(rows), loss)
 

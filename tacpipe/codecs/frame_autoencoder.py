@@ -35,6 +35,7 @@ class _Network(nn.Module):
     """Convolutions that encode images as features, and a decoder that mirrors them."""
 
     def __init__(self, components: int) -> None:
+        """Create mirrored convolutions between which an image is represented by ``components`` numbers."""
         super().__init__()
         encoder_layers: list[nn.Module] = []
         decoder_layers: list[nn.Module] = []

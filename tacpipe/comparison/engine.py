@@ -98,7 +98,7 @@ class Comparison:
         return headline(self.best, self) if self.best else None
 
     def frame(self) -> pd.DataFrame:
-        """Return one row per predictor: part, target, name, kind, settings, errors, baseline, gain, interval, p, counts."""
+        """Return a table with one row per predictor: its settings, errors, best baseline, gain with interval, and counts."""
         import pandas as pd
 
         names = list(dict.fromkeys(name for row in self.rows for name in row.differing))
@@ -170,8 +170,8 @@ def questions_of(runs: Sequence[ComparedRun]) -> list[Question]:
 def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) -> Comparison:
     """Return the comparison of methods on one question.
 
-    Baselines, oracles and controls are taken from one method's runs (`reference`), because they are equal for all
-    methods of a split; variants of the model are included for each method.
+    Models and their variants are rows for each method. Other predictors, such as baselines and oracles, are the same for
+    all methods of a split, so they are taken from one method (`reference`, if it has them).
     """
     evaluated = [method for method in methods if method.of(question)]
     measure = evaluated[0].of(question)[0].questions[question].measure
@@ -191,9 +191,12 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
             elif method is sources[predictor]:
                 entries.append((task.predictor_name(predictor), kind, predictor, method))
     ranked = [_rank_baselines(task, method, source, question, predictor) for _, _, predictor, method in entries]
-    picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
-              if kind == "model" and pairs]  # fmt: skip
-    rows = [_row(*entry, question, measure, pairs, picked) for entry, pairs in zip(entries, ranked, strict=True)]
+    model_pairs = [
+        next(iter(pairs.values()))
+        for (_, kind, _, _), pairs in zip(entries, ranked, strict=True)
+        if kind == "model" and pairs
+    ]
+    rows = [_row(*entry, question, measure, pairs, model_pairs) for entry, pairs in zip(entries, ranked, strict=True)]
     sign = -1 if measure.rises else 1
 
     def best_first(row: ComparisonRow) -> tuple[bool, float, str]:
@@ -264,16 +267,16 @@ def _row(
     question: Question,
     measure: Measure,
     pairs: Mapping[str, Pair],
-    picked: Sequence[Pair],
+    model_pairs: Sequence[Pair],
 ) -> ComparisonRow:
-    """Return the row of a predictor. ``pairs``: with its baselines, the best first.
+    """Return the row of a predictor. ``pairs`` are its pairs with its baselines by name, the best baseline first.
 
-    ``picked``: those of all methods with the best baseline, from which the best method may have been selected.
+    ``model_pairs`` are the pairs of all models with their best baselines, from which a model may have been selected.
     """
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
     run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
-    gain = pairing.gain(measure, list(pairs.values()), picked if kind == "model" else ())
+    gain = pairing.gain(measure, list(pairs.values()), model_pairs if kind == "model" else ())
     return ComparisonRow(
         name,
         kind,

@@ -167,19 +167,18 @@ def _names(dataset: Dataset) -> list[str]:
     return list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
 
 
-def labelled_frame(
+def add_label_columns(
     dataset: Dataset, tables: Mapping[str, pa.Table], names: Sequence[str] | None = None
 ) -> dict[str, pa.Table]:
-    """Return the tables of recordings with an added column per attribute: all (None) or those in ``names``.
+    """Return the tables of recordings with a column added for each attribute in ``names``, or for all if it is None.
 
-    Missing attributes are null. Raises `UsageError` for an attribute that no recording has, and for one with the name
-    of a column.
+    Missing attributes are null. Raises `UsageError` for an attribute that no recording has or that has the name of a column.
     """
     import pyarrow as pa
 
     existing = _names(dataset)
-    chosen = existing if names is None else list(dict.fromkeys(names))
-    for name in chosen:
+    selected = existing if names is None else list(dict.fromkeys(names))
+    for name in selected:
         if name not in existing:
             raise selection.unknown_label(dataset, name)
         if any(name in table.column_names for table in tables.values()):
@@ -188,10 +187,10 @@ def labelled_frame(
                 f"{plain(name)} is a label and a column of the recordings. Name the labels to add, as labels={addable!r}."
             )
     labelled_tables = {}
-    kinds = {name: _kind([dataset[recording].attributes.get(name) for recording in tables]) for name in chosen}
+    kinds = {name: _kind([dataset[recording].attributes.get(name) for recording in tables]) for name in selected}
     for recording, table in tables.items():
         labelled_table = table
-        for name in chosen:
+        for name in selected:
             value = pa.scalar(_as(dataset[recording].attributes.get(name), kinds[name]), kinds[name])
             labelled_table = labelled_table.append_column(name, pa.repeat(value, table.num_rows))
         labelled_tables[recording] = labelled_table
@@ -242,6 +241,6 @@ def connect_duckdb(dataset: Dataset) -> duckdb.DuckDBPyConnection:
     rows = {recording.name: names.slice(index, 1) for index, recording in enumerate(dataset)}
     label_names = [name for name in _names(dataset) if name != "recording"]
     connection.register(
-        LABELS_TABLE, pa.concat_tables(labelled_frame(dataset, rows, label_names).values()) if rows else names
+        LABELS_TABLE, pa.concat_tables(add_label_columns(dataset, rows, label_names).values()) if rows else names
     )
     return connection

@@ -334,7 +334,7 @@ class Dataset:
         if labels is not False:
             from tacpipe.datasets import arrays
 
-            tables = arrays.labelled_frame(self, tables, None if labels is True else labels)
+            tables = arrays.add_label_columns(self, tables, None if labels is True else labels)
         return one_after_another(tables)
 
     to_arrow = table

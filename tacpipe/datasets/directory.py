@@ -264,16 +264,16 @@ def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[
 def _compare_files(
     current: Manifest | None, manifest: Manifest, directory: Path, *, is_complete: bool
 ) -> tuple[dict[str, str], set[str]]:
-    """Return path and digest of the files to place in ``directory``, and the paths to remove.
+    """Return path and digest of the files to write to ``directory``, and the paths to remove.
 
-    Placed are files that are missing or have another size, and those that differ from ``current``, its current
+    Files are written if they are missing, have the wrong size, or differ from ``current``, the directory's current
     manifest. If all files of ``current`` exist (``is_complete``), pages in both manifests are skipped.
     """
     stale, removed = _compare_pages(current, manifest, directory)
     files = {} if current is None else current.files
     manifests = {} if current is None else current.recordings, manifest.recordings
-    for name, before, now in pages.compared(*(pages.differing(*manifests) if is_complete else manifests)):
-        old, new = ({} if entry is None else entry["shards"] for entry in (before, now))
+    for name, old_entry, new_entry in pages.compared(*(pages.differing(*manifests) if is_complete else manifests)):
+        old, new = ({} if entry is None else entry["shards"] for entry in (old_entry, new_entry))
         removed.update(shard_path(name, stream) for stream in old if stream not in new)
         for stream, shard in new.items():
             path = shard_path(name, stream)
@@ -287,13 +287,13 @@ def _compare_files(
 
 
 def _compare_pages(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
-    """Return path and digest of the pages to place, and the paths of those to remove, as `_compare_files` does."""
-    before, now = (
+    """Return path and digest of the pages to write, and the paths of the pages to remove; see `_compare_files`."""
+    old, new = (
         {} if side is None or side.pages is None else {page.path: page for page in side.pages.pages}
         for side in (current, manifest)
     )
-    lies = {path for path, page in now.items() if path in before and _is_in_place(directory, path, page.bytes)}
-    return {path: page.digest for path, page in now.items() if path not in lies}, before.keys() - now.keys()
+    present = {path for path, page in new.items() if path in old and _is_in_place(directory, path, page.bytes)}
+    return {path: page.digest for path, page in new.items() if path not in present}, old.keys() - new.keys()
 
 
 def _has_same_digest(before: Content | None, now: Content) -> bool:

@@ -113,7 +113,7 @@ def change_each(path: Path, new_labels: Callable[[ByRecording], ByRecording]) ->
     Recordings that already have the labels are not changed, so nothing is recomputed for them.
     """
     return _change(
-        path, lambda dataset: differing(attributes(dataset.manifest), new_labels(attributes(dataset.manifest)))
+        path, lambda dataset: changed_labels(attributes(dataset.manifest), new_labels(attributes(dataset.manifest)))
     )
 
 
@@ -122,7 +122,7 @@ def planned(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> tup
     dataset = manifest_of.find(path)
     _refuse_made(dataset.manifest, dataset.directory)
     now = attributes(dataset.manifest)
-    return now, differing(now, new_labels(now))
+    return now, changed_labels(now, new_labels(now))
 
 
 def attributes(manifest: Manifest) -> ByRecording:
@@ -131,15 +131,15 @@ def attributes(manifest: Manifest) -> ByRecording:
     return {name: entry["attributes"] for part in parts for name, entry in part.items()}
 
 
-def differing(now: ByRecording, labels_by_name: ByRecording) -> dict[str, dict[str, Attribute]]:
-    """Return the labels in ``labels_by_name`` that differ from ``now``, by recording; 1 differs from true.
+def changed_labels(current: ByRecording, new: ByRecording) -> dict[str, dict[str, Attribute]]:
+    """Return the labels in ``new`` that differ from ``current``, by recording; 1 differs from true.
 
-    >>> differing({"a": {"n": 1}, "b": {"n": 1}}, {"a": {"n": 1}, "b": {"n": True, "m": None}})
+    >>> changed_labels({"a": {"n": 1}, "b": {"n": 1}}, {"a": {"n": 1}, "b": {"n": True, "m": None}})
     {'b': {'n': True}}
     """
     differences = {
-        name: {key: value for key, value in labels.items() if _differ(now[name].get(key), value)}
-        for name, labels in labels_by_name.items()
+        name: {key: value for key, value in labels.items() if _differ(current[name].get(key), value)}
+        for name, labels in new.items()
     }
     return {name: labels for name, labels in differences.items() if labels}
 

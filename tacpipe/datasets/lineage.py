@@ -19,7 +19,7 @@ from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
 from tacpipe.printable import listed
 from tacpipe.store import records
 from tacpipe.store.location import locate
-from tacpipe.store.records import Provenance, RecordingEntry, RunIdentity
+from tacpipe.store.records import Content, Provenance, RecordingEntry, RunIdentity
 from tacpipe.store.roots import Root
 from tacpipe.store.store import Store
 
@@ -172,23 +172,29 @@ def _has_equal_content(before: Manifest, now: Manifest) -> bool:
 def _input_changes(
     store: Store, argument: str, before: Sequence[InputDataset], now: Sequence[InputDataset]
 ) -> list[str]:
-    """Return lines on how the inputs of an argument differ: recordings and files. Raises `StorageError`."""
+    """Return lines that describe how the recordings and files of an argument's datasets differ.
+
+    Raises `StorageError` if the store cannot be read.
+    """
     if [dataset["dataset"] for dataset in before] == [dataset["dataset"] for dataset in now]:
         return []
     try:
-        old, new = (
-            [manifest_of.stored(store, dataset["manifest"], argument) for dataset in datasets]
-            for datasets in (before, now)
-        )
+        old_manifests = [manifest_of.stored(store, dataset["manifest"], argument) for dataset in before]
+        new_manifests = [manifest_of.stored(store, dataset["manifest"], argument) for dataset in now]
     except StorageError:
         raise
     except TacpipeError:
         return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
-    lines = _compare_recordings(f"inputs.{argument}", *(_merged_recordings(manifests) for manifests in (old, new)))
-    files = (
-        {name: file for manifest in manifests for name, file in manifest.files.items()} for manifests in (old, new)
-    )
-    return [*lines, *_compare_groups(f"inputs.{argument}.files", *files)]
+    old_recordings, new_recordings = _merged_recordings(old_manifests), _merged_recordings(new_manifests)
+    old_files, new_files = _merged_files(old_manifests), _merged_files(new_manifests)
+    return [
+        *_compare_recordings(f"inputs.{argument}", old_recordings, new_recordings),
+        *_compare_groups(f"inputs.{argument}.files", old_files, new_files),
+    ]
+
+
+def _merged_files(manifests: Sequence[Manifest]) -> dict[str, Content]:
+    return {name: file for manifest in manifests for name, file in manifest.files.items()}
 
 
 def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, RecordingEntry]:
@@ -276,7 +282,7 @@ def _leaves(params: StoredParams) -> StoredParams:
 
 
 def _nested_lines(name: str, tree: StoredParams) -> list[str]:
-    """Return the lines of a param with parts: plain values on one line, lists of columns as a table.
+    """Return the lines of a nested param: plain values on one line, lists of columns as a table.
 
     >>> _nested_lines("layout", {"unit": "ns", "columns": [{"match": "x", "unit": "N"}, {"match": "dx"}]})
     ['layout: unit ns', 'layout.columns:', '  match  unit', '  x      N', '  dx']
@@ -317,7 +323,8 @@ def _lines(node: LineageNode | LostNode, depth: int, described: set[str], argume
         if node["recordings"]
         else _files(node)
     )
-    nested = {name: tree for name, value in node["params"].items() if (tree := _nested_params(value)) is not None}
+    trees = {name: _nested_params(value) for name, value in node["params"].items()}
+    nested = {name: tree for name, tree in trees.items() if tree is not None}
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items() if name not in nested)
     lines = [
         f"{place}  {content}",

@@ -149,14 +149,18 @@ class Manifest:
 
     @cached_property
     def excluded(self) -> Mapping[str, Attribute]:
-        """Reason for exclusion by recording."""
+        """The reason of each excluded recording, by name."""
         recordings = self.recordings
-        parts: Iterable[Mapping[str, RecordingEntry]] = [recordings]
+        groups: Iterable[Mapping[str, RecordingEntry]] = [recordings]
         if isinstance(recordings, pages_of.Recordings):
             pages = recordings.pages
-            parts = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
-        reasons = ((name, entry["attributes"].get(pages_of.EXCLUDED)) for part in parts for name, entry in part.items())
-        return {name: reason for name, reason in reasons if reason}
+            groups = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
+        reasons = {}
+        for group in groups:
+            for name, entry in group.items():
+                if reason := entry["attributes"].get(pages_of.EXCLUDED):
+                    reasons[name] = reason
+        return reasons
 
     def with_recordings(self, items: Mapping[str, Item | None]) -> Manifest:
         """Return the manifest with recordings added or replaced; None removes one."""

@@ -166,7 +166,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def _labels(dataset: Dataset) -> str:
-    """Return the labels with few values and the number of recordings for each value; other labels are counted."""
+    """Return a text with the labels that have few values, how many recordings have each, and the number of other labels."""
     names = list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
     descriptions = []
     for name in names:

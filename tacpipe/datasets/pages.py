@@ -138,7 +138,7 @@ class PageContent:
         return canonical(vars(self))
 
     def describe(self, stored: bytes, *, name: str = "") -> Page:
-        """Return this page's entry in a root. ``stored`` is its object, ``name`` its digest if known."""
+        """Return the entry of this page in a manifest. ``stored`` are the page's bytes, ``name`` their digest if known."""
         shards = [shard for entry in self.recordings.values() for shard in entry["shards"].values()]
         return Page(
             next(iter(self.recordings)),
@@ -278,7 +278,7 @@ class Pages:
 
     @classmethod
     def joined(cls, parts: Iterable[Pages]) -> Pages:
-        """Return the recordings of several parts, sorted by name and divided into pages."""
+        """Join consecutive parts, sorted by name, and merge pages whose first recording no longer begins a page."""
         divided: list[Page] = []
         fresh: dict[str, bytes] = {}
         read: PageReader | None = None

@@ -132,17 +132,17 @@ class Windows(torch.utils.data.Dataset[Window]):
         count = len(self)
         if not -count <= index < count:
             raise IndexError(f"There are {count} windows, and none has the index {index}.")
-        place = index % count
+        position = index % count
         ends = self._index()
-        number = int(np.searchsorted(ends, place, side="right"))
-        name = self._names[number]
+        recording_index = int(np.searchsorted(ends, position, side="right"))
+        name = self._names[recording_index]
         rows = self._rows(name)
-        first = int(rows.starts[place - (int(ends[number - 1]) if number else 0)])
-        now, last = first + self.context, first + self.context + self.horizon
+        start = int(rows.starts[position - (int(ends[recording_index - 1]) if recording_index else 0)])
+        split, stop = start + self.context, start + self.context + self.horizon
         return {
-            "past": self._past.apply(rows.values[first:now]),
-            "future": self._future.apply(rows.values[now:last]),
-            "t_ns": rows.t_ns[first:last],
+            "past": self._past.apply(rows.values[start:split]),
+            "future": self._future.apply(rows.values[split:stop]),
+            "t_ns": rows.t_ns[start:stop],
             "recording": name,
         }
 

@@ -47,11 +47,11 @@ class ByRecording:
     previous: Previous | None = None  # earlier run whose unchanged results are reused
 
     def run_step(self, source: Manifest, step: Step, dataset_dirs: tuple[str, ...]) -> Mapping[str, RecordingEntry]:
-        """Return the result of a map stage, one link of a chain, for each recording of ``source``; raises as `run`.
+        """Return the result of a map stage, one link of a chain, for each recording of ``source``.
 
         Each group of recordings has a record in addition to the records of its recordings. If one recording changed,
         one record is read per group, plus one per recording of the changed group. Results of many recordings are stored
-        in pages.
+        in pages. Raises the errors of `run`.
         """
         entries, name, stage = source.included, step["stage"], registry.load_step(step["stage"])
         results_or_pending: list[Answer | _RecordingGroup] = []

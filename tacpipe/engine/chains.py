@@ -79,7 +79,7 @@ def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Variables]]:
 
 
 def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Variables]]:
-    """Yield the name part and the variables of each combination of a ``matrix``, which has a list of items per axis.
+    """Yield a name and the variables of each combination of a ``matrix``, which has a list of items per axis.
 
     Raises `UsageError` if ``axes`` is not a mapping of lists.
     """
@@ -348,7 +348,7 @@ def _read_mapping(file: Path, *, missing: bool = False) -> Json:
 
 
 def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozenset[str]]:
-    """Return for each stage the names of the stages whose outputs, or parts of them, it reads.
+    """Return, for each stage, the names of the stages whose outputs (or files within them) it reads.
 
     Raises `UsageError` if two stages write to the same path, or one within a path of the other.
     """
@@ -366,14 +366,14 @@ def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozens
                 raise UsageError(
                     f"{file}: the stage {name} writes {plain(path)} within {plain(folder)}, which {writers[folder]} writes."
                 )
-    after = {}
+    dependencies = {}
     for stage in stages:
         providers = {
             writers[location] for path in stage.reads for location in (path, *_above(path)) if location in writers
         }
         providers |= {name for path in stage.reads for name in writers_below.get(path, ())}
-        after[stage.name] = frozenset(providers - {stage.name})
-    return after
+        dependencies[stage.name] = frozenset(providers - {stage.name})
+    return dependencies
 
 
 def _above(path: str) -> Iterator[str]:

@@ -127,7 +127,7 @@ def _store_returned(returned: Result, sink: Store | ScratchStore, *, durable: bo
 def differences(stored: StoredResult, recomputed: StoredResult, name: str) -> list[str]:
     """Return the paths of shards and files whose content differs. ``name`` is the recording of a map stage."""
 
-    def contents(result: StoredResult) -> dict[str, str]:
+    def digests_by_path(result: StoredResult) -> dict[str, str]:
         shards = {
             shard_path(recording or name, stream): shard["digest"]
             for recording, entry in result["recordings"].items()
@@ -135,8 +135,8 @@ def differences(stored: StoredResult, recomputed: StoredResult, name: str) -> li
         }
         return {**shards, **{file: value["digest"] for file, value in result["files"].items()}}
 
-    before, now = contents(stored), contents(recomputed)
-    return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+    old_digests, new_digests = digests_by_path(stored), digests_by_path(recomputed)
+    return sorted(path for path in {*old_digests, *new_digests} if old_digests.get(path) != new_digests.get(path))
 
 
 class _Reader:

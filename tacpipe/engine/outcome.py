@@ -93,19 +93,25 @@ class Outcome:
         return f"these differ from what is stored: {'; '.join(self.differs)}{computers}"
 
     def describe_results(self) -> list[str]:
-        """Return the notes of stages, and warnings about results computed by other code than the stage has now."""
+        """Return the notes of stages, and warnings about results that an earlier version of the code computed."""
         count = self.ran + self.reused
         lines = []
         for text, names in self.recordings_by_note.items():
             subject = names[0]  # empty for a stage that reads whole datasets
             if len(names) > 1:
-                named = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
-                subject = f"all {count} recordings" if len(names) == count else named
+                some_recordings = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
+                subject = f"all {count} recordings" if len(names) == count else some_recordings
             lines.append(f"{subject}: {text}" if subject else text)
-        stages = {name: line for name, counts in self.code.items() if (line := _other_code(name, counts))}
-        packages = {name: line for name, counts in self.packages.items() if (line := _other_package(name, counts))}
-        described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
-        return [*lines, *stages.values(), *(line for name, line in packages.items() if name not in described)]
+        described_packages = set()
+        for stage, counts in self.code.items():
+            if warning := _other_code(stage, counts):
+                lines.append(warning)
+                described_packages.add(registry.package_of_stage(stage))
+        for package, counts in self.packages.items():
+            warning = _other_package(package, counts)
+            if warning and package not in described_packages:
+                lines.append(warning)
+        return lines
 
     def to_json(self) -> OutcomeJson:
         """Return the outcome as JSON for the command's output."""

@@ -329,9 +329,7 @@ class _RequestRun:
     def _identity_of_argument(self, name: str, kind: str) -> Any:
         """Return the part of the key for an argument that is not a single recording, such as a dataset or a model.
 
-        Recordings are replayed through the model's chain, unless the stage takes them as given. With a split, those of the
-        role that ``name`` names are selected, otherwise those of ``--role`` or test. None if there is no initial model.
-        Raises `UsageError` for ``--role`` without a split.
+        It is None for an initial model that was not given.
         """
         inputs, reads = self.inputs, self.stage.reads
         if kind == "Model" and name == "init":
@@ -346,12 +344,21 @@ class _RequestRun:
         if kind == "Parts":
             return keys.of_dataset(self._parts, None, self._parts.recordings)
         if self.stage.part is not None:
-            source = self.inputs.merged if name == ORIGINALS else self._source
-            chosen = {
+            source = inputs.merged if name == ORIGINALS else self._source
+            read_recordings = {
                 recording: entry for recording, entry in source.included.items() if recording in self._parts.recordings
             }
-            return keys.of_dataset(source, reads, chosen)
-        source = inputs.merged
+            return keys.of_dataset(source, reads, read_recordings)
+        return self._identity_of_recordings(name)
+
+    def _identity_of_recordings(self, name: str) -> Any:
+        """Return the part of the key for the recordings of argument ``name``.
+
+        They are replayed through the model's chain, unless the stage takes them as given. With a split, only recordings of
+        one role are used: the role that ``name`` names, else ``--role``, else test. Raises `UsageError` for ``--role``
+        without a split.
+        """
+        inputs, reads, source = self.inputs, self.stage.reads, self.inputs.merged
         as_given = self.stage.as_given
         if "model" in inputs.named_datasets and not (as_given is not None and as_given(self.request.params)):
             dataset_name = str(self.request.datasets[0])

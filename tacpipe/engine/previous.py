@@ -59,20 +59,20 @@ class Previous:
             return None
         if not self._is_same_step(step):
             return None
-        now = {page.digest for page in entries.pages.pages}
+        present_digests = {page.digest for page in entries.pages.pages}
         firsts = [page.first for page in results.pages] + [""]
-        places = {first: number for number, first in enumerate(firsts)}
+        number_by_first = {first: number for number, first in enumerate(firsts)}
         earlier_pages = earlier_entries.pages.pages
-        followers = [*(page.first for page in earlier_pages[1:]), ""]
+        next_firsts = [*(page.first for page in earlier_pages[1:]), ""]
         reusable: dict[str, Pages] = {}
         replaced_pages = set(range(len(results)))
-        for page, follower in zip(earlier_pages, followers, strict=True):
-            number = places.get(page.first)
-            if page.digest not in now or number is None or number == len(results):
+        for page, next_first in zip(earlier_pages, next_firsts, strict=True):
+            number = number_by_first.get(page.first)
+            if page.digest not in present_digests or number is None or number == len(results):
                 continue
             # equal first names and counts mean that the page has the results of exactly these recordings
             result = results.pages[number]
-            covers_page = firsts[number + 1] == follower and result.recordings == page.recordings
+            covers_page = firsts[number + 1] == next_first and result.recordings == page.recordings
             if covers_page and self.store.has(result.digest, result.bytes):
                 reusable[page.digest] = results.part(number)
                 replaced_pages.discard(number)
@@ -87,12 +87,12 @@ class Previous:
         return root is not None and root["manifest"] == self.note.head.manifest and self.look.unchanged
 
     def succeed(self, head: Head, published: Manifest) -> bool:
-        """Note that the directory now contains all of ``published``; return False if this requires checking each file."""
-        before, now = pages.differing(self.result.recordings, published.recordings)
-        removed = [shard_path(name, stream) for name, entry in before.items() for stream in entry["shards"]]
+        """Record that the directory now contains all of ``published``. Return False if each file must be checked instead."""
+        removed_entries, placed_entries = pages.differing(self.result.recordings, published.recordings)
+        removed = [shard_path(name, stream) for name, entry in removed_entries.items() for stream in entry["shards"]]
         placed = [
             (shard_path(name, stream), shard["digest"], shard["bytes"])
-            for name, entry in now.items()
+            for name, entry in placed_entries.items()
             for stream, shard in entry["shards"].items()
         ]
         for manifest in (self.result, published):

@@ -256,12 +256,9 @@ def _labels(recordings: Dataset) -> bytes:
     from tacpipe.io.parquet import to_parquet
 
     rows = {recording.name: pa.table({RECORDING: pa.array([recording.name], pa.string())}) for recording in recordings}
-    names = [
-        name
-        for name in dict.fromkeys(name for recording in recordings for name in recording.attributes)
-        if name != RECORDING
-    ]
-    return to_parquet(pa.concat_tables(arrays.labelled_frame(recordings, rows, names).values()))
+    all_names = dict.fromkeys(name for recording in recordings for name in recording.attributes)
+    names = [name for name in all_names if name != RECORDING]
+    return to_parquet(pa.concat_tables(arrays.add_label_columns(recordings, rows, names).values()))
 
 
 def _readme(params: Params, recordings: Dataset, described: Contents, patterns: dict[str, str]) -> bytes:

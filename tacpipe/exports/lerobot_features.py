@@ -98,7 +98,7 @@ class FrameFeature:
 
 
 def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
-    """Return the features of a synchronized recording, in a fixed order."""
+    """Return the features of a synchronized recording: state, action, tactile, other signals, then the original columns."""
     import numpy as np
 
     from tacpipe.exports import frames
@@ -108,17 +108,17 @@ def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
     taxels = [channel for channel in channels if channel.signal and channel.quantity == frames.TACTILE]
     state = [channel for channel in state if channel not in taxels]
 
-    def make_vector(name: str, members: Sequence[Channel], *, later: bool = False) -> FrameFeature:
+    def make_vector(name: str, members: Sequence[Channel], *, from_next_frame: bool = False) -> FrameFeature:
         is_one_stream = len({channel.stream for channel in members}) == 1
         names = [channel.short if is_one_stream else channel.name for channel in members]
-        return FrameFeature(name, members, names, np.dtype(np.float32), later)
+        return FrameFeature(name, members, names, np.dtype(np.float32), from_next_frame)
 
     vectors: list[FrameFeature] = []
-    observed = [*state, *taxels] if params.tactile_in_state else state
-    vectors += [make_vector("observation.state", observed)] if observed else []
+    state_channels = [*state, *taxels] if params.tactile_in_state else state
+    vectors += [make_vector("observation.state", state_channels)] if state_channels else []
     if params.actions:
-        members, later = frames.action_channels(channels, params.actions)
-        vectors.append(make_vector(ACTION, members, later=later))
+        members, from_next_frame = frames.action_channels(channels, params.actions)
+        vectors.append(make_vector(ACTION, members, from_next_frame=from_next_frame))
     signals = [channel for channel in channels if channel.signal and channel not in state]
     for stream in dict.fromkeys(channel.stream for channel in signals):
         tactile = [channel for channel in signals if channel.stream == stream and channel in taxels]

@@ -113,7 +113,7 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
     from tacpipe.exports.pictures import Pictures
     from tacpipe.video.stream import read_format
 
-    starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
+    starts = [start for start in (_start(recording, stream) for stream in recording.streams) if start is not None]
     for stream in recording.streams:
         table = recording.columns(stream)
         if TIME not in table.column_names:

@@ -212,7 +212,7 @@ class Topic:
 
 
 def stream_topic(stream: str, table: pa.Table) -> Topic:
-    """Return the topic of a stream with all columns in their own types; the header has the timestamps.
+    """Return the topic of a stream, with timestamps in the header and one field per column, of the column's type.
 
     Its metadata contain the original names and metadata of stream and columns. Columns of types that no message
     supports are omitted; a missing integer becomes 0, a missing float NaN, a missing text empty.

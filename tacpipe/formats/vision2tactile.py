@@ -182,7 +182,10 @@ def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) ->
 
 
 def _read_counts(path: Path) -> list[int]:
-    """Return the 58 counts in a reading's line, which starts with a comma. Raises `TacpipeError` for other lines."""
+    """Return the 58 counts of a reading's file. Raises `TacpipeError` unless it is a single valid line.
+
+    The line starts with a comma.
+    """
     lines = _read_lines(path)
     if len(lines) != 1:
         raise TacpipeError(

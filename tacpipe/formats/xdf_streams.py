@@ -8,13 +8,14 @@ from the start of a computer.
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 import tempfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -32,34 +33,35 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.signals import clocks
 
-STAMP = "lsl_ns"
-RAW = "t_device_ns"
-OFFSETS = " clock offsets"  # suffix of the name of a stream's offsets
+RECORDER_TIME, SENDER_TIME = "lsl_ns", "t_device_ns"  # names of columns
+OFFSETS_SUFFIX = " clock offsets"  # appended to a stream's name, it names the stream of its clock offsets
 UNDESCRIBED = "the file does not describe it"
-CLOCK = "LSL's, of the computer that recorded"
+RECORDER_CLOCK, SENDER_CLOCK = "LSL's, of the computer that recorded", "LSL's, of the sender"
 SPILL_ROWS = 1 << 16  # samples per stream in memory before they are written to the spill file
-PASSED_BYTES = 1 << 26  # number of bytes read before their pages are released
-COMPRESSED_BYTES = 1 << 20  # number of bytes decompressed at once
+RELEASE_BYTES = 1 << 26  # number of bytes read before their pages are released
+INFLATE_BYTES = 1 << 20  # maximum number of bytes decompressed at once
 
 
 @dataclass
 class _StreamReading:
-    """The samples, stamps and offsets of a stream read so far."""
+    """The samples, timestamps and clock offsets of a stream that have been read so far."""
 
     about: lsl.LslDescription
     spill: Spill
     stamps: list[Floats] = field(default_factory=list)
     values: list[AnyArray] = field(default_factory=list)  # (sample, channel), samples not yet written to the spill file
     pieces: list[Piece] = field(default_factory=list)
-    waiting: int = 0  # number of samples in ``values``
-    offsets: list[tuple[float, float]] = field(default_factory=list)  # clock reading, offset to add
+    unspilled_rows: int = 0  # number of samples in ``values``
+    offsets: list[tuple[float, float]] = field(
+        default_factory=list
+    )  # reading of the sender's clock, offset to add, in s
     rows_before: list[int] = field(default_factory=list)  # (offset,), number of samples before it in the file
     rows: int = 0
     missing: int = 0  # number of samples in incomplete chunks
-    declared: int | None = None  # number of samples according to the footer
+    declared_rows: int | None = None  # number of samples according to the footer
 
     def add_samples(self, content: bytes) -> None:
-        """Add the samples of a chunk; timestamps that are not written continue at the stream's rate."""
+        """Add the samples of a chunk. Omitted timestamps continue at the stream's rate."""
         channels = len(self.about.channels)
         samples = (
             xdf_chunks.parse_texts(content, channels)
@@ -69,22 +71,22 @@ class _StreamReading:
         if samples is None:
             self.missing += 1
             return
-        last = float(self.stamps[-1][-1]) if self.rows else 0.0
+        last_s = float(self.stamps[-1][-1]) if self.rows else 0.0
         period_s = 1 / self.about.rate_hz if self.about.rate_hz else 0.0
         self.missing += samples.missing
         if len(samples.stamps):
-            self.stamps.append(xdf_chunks.fill_stamps(samples.stamps, last, period_s))
+            self.stamps.append(xdf_chunks.fill_stamps(samples.stamps, last_s, period_s))
             self.values.append(samples.values)
             self.rows += len(samples.stamps)
-            self.waiting += len(samples.stamps)
-            if self.waiting >= SPILL_ROWS:
+            self.unspilled_rows += len(samples.stamps)
+            if self.unspilled_rows >= SPILL_ROWS:
                 self.pieces.append(self.spill.add(pa.table(self._columns(), pa.schema(self.fields))))
-                self.values, self.waiting = [], 0
+                self.values, self.unspilled_rows = [], 0
 
     @property
     def fields(self) -> list[pa.Field]:
         """The fields of the channels."""
-        reserved = [STAMP, RAW, "t_ns"]
+        reserved = [RECORDER_TIME, SENDER_TIME, "t_ns"]
         kind = pa.string() if self.about.is_text else pa.from_numpy_dtype(self.about.dtype)
         return [
             pa.field(
@@ -99,12 +101,12 @@ class _StreamReading:
         """Yield the values of the channels in batches of samples."""
         for piece in self.pieces:
             yield self.spill.read(piece).columns
-        if self.waiting:
+        if self.unspilled_rows:
             yield self._columns()
 
     def _columns(self) -> list[pa.ChunkedArray]:
         values = np.concatenate(self.values)
-        return [pa.chunked_array([pa.array(values[:, at], field.type)]) for at, field in enumerate(self.fields)]
+        return [pa.chunked_array([pa.array(values[:, index], field.type)]) for index, field in enumerate(self.fields)]
 
 
 @dataclass
@@ -114,7 +116,7 @@ class _FileReading:
     spill: Spill = field(default_factory=Spill)
     streams: dict[int, _StreamReading] = field(default_factory=dict)
     headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
-    unknown: dict[int, str] = field(default_factory=dict)  # reason by stream whose description cannot be read
+    unreadable: dict[int, str] = field(default_factory=dict)  # stream -> reason why its description cannot be read
     header: bytes = b""
     damage: list[DamagedChunk] = field(default_factory=list)
     cut_at: int | None = None  # offset of the incomplete chunk at the end of a truncated file
@@ -123,7 +125,7 @@ class _FileReading:
         """Return sentences about missing data."""
         sentences = []
         if self.damage:
-            size, first = sum(damage.bytes for damage in self.damage), self.damage[0].at
+            size, first = sum(chunk.bytes for chunk in self.damage), self.damage[0].at
             places = (
                 f"in {len(self.damage)} places, the first at byte {first:,},"
                 if len(self.damage) > 1
@@ -132,7 +134,7 @@ class _FileReading:
             sentences.append(f"{path}: {size:,} bytes {places} are not XDF and were left out.")
         if self.cut_at is not None:
             sentences.append(f"{path} was cut off at byte {self.cut_at:,}, within a chunk; what stands before is read.")
-        undescribed = sum(reason == UNDESCRIBED for reason in self.unknown.values())
+        undescribed = sum(reason == UNDESCRIBED for reason in self.unreadable.values())
         if undescribed:
             sentences.append(
                 f"{path} has samples of {undescribed} streams that it does not describe; they were left out."
@@ -162,31 +164,31 @@ class XdfFile:
         reading = self._read()
         sources_by_number = _stream_sources(reading.streams)
         names = container.identifiers(
-            [name for source in sources_by_number.values() for name in (source, source + OFFSETS)]
+            [name for source in sources_by_number.values() for name in (source, source + OFFSETS_SUFFIX)]
         )
         streams: list[SourceStream] = []
         attributes = _file_attributes(reading.header)
         notes = reading.notes(self.path)
-        skipped = {f"stream {number}": reason for number, reason in reading.unknown.items() if reason != UNDESCRIBED}
+        skipped = {f"stream {number}": reason for number, reason in reading.unreadable.items() if reason != UNDESCRIBED}
         for number, source in sources_by_number.items():
             stream = reading.streams[number]
             if not stream.rows:
                 skipped[source] = "it has no samples"
                 continue
-            times_or_reason = _recorder_times(stream)
-            if isinstance(times_or_reason, str):
-                skipped[source] = times_or_reason
+            times = _recorder_times(stream)
+            if isinstance(times, str):
+                skipped[source] = times
                 continue
-            t_ns, facts, remarks = times_or_reason
-            notes += [f"{self.path}: {plain(source)} {remark}" for remark in [*remarks, *_describe_losses(stream)]]
-            attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
-            streams.append(
-                SourceStream(source, names[source], Time(STAMP, "ns"), _stream_content(stream, t_ns), stream.rows)
-            )
+            notes += [
+                f"{self.path}: {plain(source)} {remark}" for remark in [*times.remarks, *_describe_losses(stream)]
+            ]
+            attributes |= {f"{names[source]}_{name}": value for name, value in times.attributes.items()}
+            content = _stream_content(stream, times.t_ns)
+            streams.append(SourceStream(source, names[source], Time(RECORDER_TIME, "ns"), content, stream.rows))
             if stream.offsets:
-                offsets = _offsets_table(stream)
-                name = names[source + OFFSETS]
-                streams.append(SourceStream(source + OFFSETS, name, Time(STAMP, "ns"), offsets, offsets.num_rows))
+                offsets, offsets_source = _offsets_table(stream), source + OFFSETS_SUFFIX
+                name = names[offsets_source]
+                streams.append(SourceStream(offsets_source, name, Time(RECORDER_TIME, "ns"), offsets, offsets.num_rows))
         selected = [stream for stream in streams if sources is None or stream.source in sources]
         return EpisodeContents(selected, attributes, skipped, notes)
 
@@ -195,13 +197,13 @@ class XdfFile:
         reading = _FileReading()
         try:
             content = _open_content(self.path)
-            passed = 0  # bytes since pages were last released
+            released = 0  # number of bytes at the start of the file whose pages have been released
             for chunk in xdf_chunks.read_chunks(content):
                 _add_chunk(reading, chunk, self.path)
-                if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
-                    # without this, the whole file stays mapped in memory
-                    content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
-                    passed += PASSED_BYTES
+                if isinstance(content, mmap.mmap) and chunk.at >= released + RELEASE_BYTES:
+                    # otherwise, all pages that were read would stay in memory
+                    content.madvise(mmap.MADV_DONTNEED, released, RELEASE_BYTES)
+                    released += RELEASE_BYTES
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
         except UsageError:
@@ -214,65 +216,65 @@ class XdfFile:
 def _open_content(path: Path) -> xdf_chunks.Content:
     """Return the decompressed bytes of a file, up to the cut if a compressed file is truncated."""
     with regular.failing(path), regular.opened(path) as file, tempfile.TemporaryFile() as unpacked:
-        head = file.read(2)
-        if head == b"\x1f\x8b":
+        content: BinaryIO = file
+        if file.read(2) == b"\x1f\x8b":  # gzip
             file.seek(0)
             unpack(_gzip_blocks(file), unpacked, path)
             unpacked.flush()
-            head = b"" if not unpacked.tell() else head
-        if not head:
+            content = unpacked
+        if not content.seek(0, os.SEEK_END):  # an empty file cannot be mapped
             return b""
-        return mmap.mmap((unpacked if head == b"\x1f\x8b" else file).fileno(), 0, access=mmap.ACCESS_READ)
+        return mmap.mmap(content.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def _gzip_blocks(file: BinaryIO) -> Iterator[bytes]:
     """Yield the content of a file of one or more gzip members, up to the cut if it is truncated."""
     stream = zlib.decompressobj(wbits=31)
-    while data := file.read(COMPRESSED_BYTES):
+    while data := file.read(INFLATE_BYTES):
         while data:
             if stream.eof:
                 stream = zlib.decompressobj(wbits=31)
-            yield stream.decompress(data, COMPRESSED_BYTES)
+            yield stream.decompress(data, INFLATE_BYTES)
             data = stream.unused_data if stream.eof else stream.unconsumed_tail
-    while not stream.eof and (block := stream.decompress(stream.unconsumed_tail, COMPRESSED_BYTES)):
+    while not stream.eof and (block := stream.decompress(stream.unconsumed_tail, INFLATE_BYTES)):
         yield block
 
 
-def _add_chunk(read: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> None:
+def _add_chunk(reading: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -> None:
     """Add a chunk to the contents read so far."""
     if isinstance(chunk, DamagedChunk):
-        read.damage.append(chunk)
+        reading.damage.append(chunk)
         return
     if not chunk.is_complete:
-        read.cut_at = chunk.at
+        reading.cut_at = chunk.at
     if chunk.tag == xdf_chunks.FILE_HEADER:
-        read.header = chunk.content
+        reading.header = chunk.content
     elif chunk.stream is None:
         return
     elif chunk.tag == xdf_chunks.STREAM_HEADER:
-        _store_description(read, chunk.stream, chunk, path)
-    elif chunk.stream not in read.streams:
-        read.unknown.setdefault(chunk.stream, UNDESCRIBED)
+        _store_description(reading, chunk.stream, chunk, path)
+    elif chunk.stream not in reading.streams:
+        reading.unreadable.setdefault(chunk.stream, UNDESCRIBED)
     elif chunk.tag == xdf_chunks.SAMPLES:
-        read.streams[chunk.stream].add_samples(chunk.content)
+        reading.streams[chunk.stream].add_samples(chunk.content)
     elif chunk.tag == xdf_chunks.CLOCK_OFFSET and len(chunk.content) >= 16:
-        stream = read.streams[chunk.stream]
+        stream = reading.streams[chunk.stream]
         stream.offsets.append(struct.unpack_from("<dd", chunk.content))
         stream.rows_before.append(stream.rows)
     elif chunk.tag == xdf_chunks.STREAM_FOOTER:
-        read.streams[chunk.stream].declared = _sample_count(chunk.content)
+        reading.streams[chunk.stream].declared_rows = _sample_count(chunk.content)
 
 
-def _store_description(read: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
+def _store_description(reading: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
     """Store the description of a stream. Raises `UsageError` for a second, different description."""
-    before = read.headers.get(stream)
-    if before is None:
-        read.headers[stream] = chunk.content
+    first_header = reading.headers.get(stream)
+    if first_header is None:
+        reading.headers[stream] = chunk.content
         try:
-            read.streams[stream] = _StreamReading(lsl.parse(chunk.content), read.spill)
+            reading.streams[stream] = _StreamReading(lsl.parse(chunk.content), reading.spill)
         except TacpipeError as error:
-            read.unknown[stream] = str(error)
-    elif before != chunk.content:
+            reading.unreadable[stream] = str(error)
+    elif first_header != chunk.content:
         raise UsageError(
             f"{path} describes the stream {stream} twice, again at byte {chunk.at:,} and otherwise, so its samples cannot "
             f"be assigned. If files were joined to it, take them apart."
@@ -280,7 +282,7 @@ def _store_description(read: _FileReading, stream: int, chunk: Chunk, path: Path
 
 
 def _sample_count(footer: bytes) -> int | None:
-    """Return the number of samples in a footer, or None if it has none."""
+    """Return the number of samples according to a footer, or None if the footer does not contain it."""
     try:
         text = ET.fromstring(footer.decode(errors="replace")).findtext("sample_count", "")
     except ET.ParseError:
@@ -307,19 +309,25 @@ def _file_attributes(header: bytes) -> dict[str, Attribute]:
 def _describe_losses(stream: _StreamReading) -> list[str]:
     """Return sentences about the missing samples of a stream."""
     losses = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
-    if stream.declared is not None and stream.declared != stream.rows:
-        losses.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared:,}.")
+    if stream.declared_rows is not None and stream.declared_rows != stream.rows:
+        losses.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared_rows:,}.")
     return losses
 
 
-def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute], list[str]] | str:
-    """Return sample times on the recorder's clock (sample,), attributes of the clock fit, and remarks.
+class _RecorderTimes(NamedTuple):
+    """The times of a stream's samples on the recorder's clock."""
 
-    Returns a reason instead if the times cannot be determined.
-    """
+    t_ns: Times  # (sample,)
+    attributes: dict[str, Attribute]  # properties of the fit of the clock offsets
+    remarks: list[str]
+
+
+def _recorder_times(stream: _StreamReading) -> _RecorderTimes | str:
+    """Return the times of a stream's samples, or the reason why they cannot be determined."""
     raw_s = np.concatenate(stream.stamps)
-    if not (np.abs(raw_s) < lsl.MAX_TIME_S).all():
-        return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.MAX_TIME_S)][0]))} is not a time in seconds"
+    is_time = np.abs(raw_s) < lsl.MAX_TIME_S
+    if not is_time.all():
+        return f"its stamp {excerpt(float(raw_s[~is_time][0]))} is not a time in seconds"
     raw_ns = lsl.nanoseconds(raw_s)
     measured = _valid_offsets(stream)
     attributes: dict[str, Attribute] = {}
@@ -345,7 +353,7 @@ def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute]
         remarks.append(
             f"has {rows:,} stamps before the one above, by up to {back_ns.max() / 1e9:.6g} s: t_ns has that one for them."
         )
-    return t_ns + back_ns, attributes, remarks
+    return _RecorderTimes(t_ns + back_ns, attributes, remarks)
 
 
 def _valid_offsets(stream: _StreamReading) -> Int64s:
@@ -364,7 +372,7 @@ def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: i
     The sample is between that measurement and the previous one or, because samples are written late, just after it.
     """
     valid_rows = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
-    rows = [*(stream.rows_before[place] for place in valid_rows.tolist()), len(raw_ns)]
+    rows = [*(stream.rows_before[row] for row in valid_rows.tolist()), len(raw_ns)]
     low, high = rows[first - 1], min(rows[first + 1], len(raw_ns))
     steps = np.diff(raw_ns[max(low - 1, 0) : high])
     if not len(steps):
@@ -378,22 +386,22 @@ def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: i
 
 def _stream_content(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
     """Return the samples with their timestamps: a table if there are few, else batches from the spill file."""
-    schema = pa.schema([_time_field(STAMP), _time_field(RAW), *stream.fields])
+    schema = pa.schema([_time_field(RECORDER_TIME), _time_field(SENDER_TIME), *stream.fields])
     raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
 
     def read() -> Iterator[pa.Table]:
-        begin = 0
+        start = 0
         for columns in stream.channels():
-            end = begin + len(columns[0])
-            yield pa.table([pa.array(t_ns[begin:end]), pa.array(raw_ns[begin:end]), *columns], schema)
-            begin = end
+            stop = start + len(columns[0])
+            yield pa.table([pa.array(t_ns[start:stop]), pa.array(raw_ns[start:stop]), *columns], schema)
+            start = stop
 
     return Batched(schema, stream.rows, read) if stream.pieces else next(read())
 
 
 def _time_field(name: str) -> pa.Field:
-    about = {"unit": "ns", "quantity": "time", "clock": CLOCK if name == STAMP else "LSL's, of the sender"}
-    return pa.field(name, pa.int64(), metadata=about)
+    clock = RECORDER_CLOCK if name == RECORDER_TIME else SENDER_CLOCK
+    return pa.field(name, pa.int64(), metadata={"unit": "ns", "quantity": "time", "clock": clock})
 
 
 def _offsets_table(stream: _StreamReading) -> pa.Table:
@@ -403,4 +411,5 @@ def _offsets_table(stream: _StreamReading) -> pa.Table:
     sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)
     field = pa.field("offset_s", pa.float64(), metadata={"unit": "s", "quantity": "time"})
     columns = [pa.array(np.maximum.accumulate(sent_ns + offset_ns)), pa.array(sent_ns), pa.array(offsets_s[:, 1])]
-    return pa.Table.from_arrays(columns, schema=pa.schema([_time_field(STAMP), _time_field(RAW), field]))
+    schema = pa.schema([_time_field(RECORDER_TIME), _time_field(SENDER_TIME), field])
+    return pa.Table.from_arrays(columns, schema=schema)

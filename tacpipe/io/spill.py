@@ -136,18 +136,18 @@ def sorted_by(table: pa.Table, order: str) -> pa.Table:
 
 
 def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: str) -> Iterator[pa.Table]:
-    """Yield the rows of pieces in the order of a column; where it is equal, in the order of the pieces.
+    """Yield the rows of pieces in the order of a column; equal values are in the order of the pieces.
 
-    ``read`` returns the table of a piece. Those whose ranges of values overlap are in memory at one time. Rows of one value
-    are in one table of those that are yielded.
+    ``read`` returns the table of a piece. Only pieces whose ranges of values overlap are in memory at the same time. Rows
+    with equal values are in the same yielded table.
 
     >>> spill = Spill()
-    >>> pieces = [spill.add(pa.table({"t": one}), ["t"]) for one in ([4, 1], [3, 9], [12])]
-    >>> [one.column("t").to_pylist() for one in in_order(pieces, spill.read, "t")]
+    >>> pieces = [spill.add(pa.table({"t": values}), ["t"]) for values in ([4, 1], [3, 9], [12])]
+    >>> [table.column("t").to_pylist() for table in in_order(pieces, spill.read, "t")]
     [[1], [3, 4, 9], [12]]
     """
     remaining: list[tuple[int, pa.Table]] = []  # position of the piece, and its remaining rows
-    for position, piece in sorted(enumerate(pieces), key=lambda numbers: (numbers[1].minima[order], numbers[0])):
+    for position, piece in sorted(enumerate(pieces), key=lambda item: item[1].minima[order]):
         yield from _rows_below(remaining, order, piece.minima[order])
         remaining.append((position, sorted_by(read(piece), order)))
     yield from _rows_below(remaining, order, None)

@@ -71,20 +71,22 @@ class FolderLink(OpenLink):
             states = _file_states(self.folder)
         except OSError as error:
             raise self.lost(f"the folder cannot be read any more ({error.strerror})") from error
-        now = time.monotonic()
+        now_s = time.monotonic()
         self._delivered = {name: state for name, state in self._delivered.items() if name in states}
-        new = {name: state for name, state in states.items() if self._delivered.get(name) != state}
-        self._growing = {name: _state_and_time(self._growing.get(name), state, now) for name, state in new.items()}
-        settled = [name for name, (_, changed_s) in self._growing.items() if now - changed_s >= SETTLED_S]
+        new_states = {name: state for name, state in states.items() if self._delivered.get(name) != state}
+        self._growing = {
+            name: _state_and_time(self._growing.get(name), state, now_s) for name, state in new_states.items()
+        }
+        complete = [name for name, (_, changed_s) in self._growing.items() if now_s - changed_s >= SETTLED_S]
         self._arrivals.read_clocks()
-        entries: Arrived = []
-        for name in sorted(settled, key=lambda name: (new[name][2], name)):
-            data = _read_complete(self.folder / name, new[name])
+        arrived: Arrived = []
+        for name in sorted(complete, key=lambda name: (new_states[name][2], name)):
+            data = _read_complete(self.folder / name, new_states[name])
             if data is not None:
-                entries.append((self._arrivals.to_monotonic(new[name][2]), data))
-                self._delivered[name] = new[name]
+                arrived.append((self._arrivals.to_monotonic(new_states[name][2]), data))
+                self._delivered[name] = new_states[name]
                 del self._growing[name]
-        return entries
+        return arrived
 
     def _wake(self) -> None:
         self._wake_event.set()

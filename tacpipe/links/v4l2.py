@@ -87,7 +87,7 @@ class V4l2Device:
 
     @property
     def card(self) -> tuple[str, str, bool]:
-        """The name of the camera, where it is plugged in, and whether it captures video in buffers. Raises ``OSError``."""
+        """The camera's name, its bus address, and whether it captures video in buffers. Raises ``OSError`` if it fails."""
         _, card, bus, _, all_nodes, this_node = CAPABILITY.unpack(self.call(QUERYCAP, bytes(CAPABILITY.size)))
         capabilities = this_node if all_nodes & HAS_DEVICE_CAPS else all_nodes
         captures = capabilities & (CAN_CAPTURE | CAN_STREAM | IS_TOUCH) == CAN_CAPTURE | CAN_STREAM
@@ -208,9 +208,10 @@ class Capture:
 
 
 def _set_up(device: V4l2Device, sensor: Any, name: str) -> Capture:
-    """Set format, rate and controls from the sensor's options, and return them as the camera has set them.
+    """Set format, rate and controls from the sensor's options, and return the values that the camera chose.
 
-    Raises `DeviceError` if the camera refuses format or size, `UsageError` for a control, and ``OSError`` if it fails.
+    Raises `DeviceError` if the camera refuses format or size, `UsageError` if it refuses a control, and ``OSError`` if it
+    fails.
     """
     if not device.card[2]:
         raise OSError(errno.ENOTTY, "it does not capture video")

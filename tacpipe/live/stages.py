@@ -83,7 +83,7 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
 
 
 def run_stages(recording: Recording, model: Dataset) -> Any:
-    """Return a recording, as recorded, after the stages of a model's chain."""
+    """Run the stages of a model's chain on an original recording, and return the result."""
     processed: Any = recording
     for step in model.source.chain:
         stage = registry.load(step["stage"])

@@ -61,15 +61,15 @@ class Blocks:
         self._text += data
         offset = 0
         while offset + HEAD.size <= len(self._text):
-            mark, _, kind, number, _, count, size = HEAD.unpack_from(self._text, offset)
-            if mark != MARK:
+            magic, _, kind, stream_index, _, count, size = HEAD.unpack_from(self._text, offset)
+            if magic != MARK:
                 raise TacpipeError(
                     "The recording process sent invalid data. Check that both run the same version of tacpipe."
                 )
             stop = offset + HEAD.size + size
             if stop > len(self._text):
                 break
-            stream = "" if number == WHOLE else self._streams[number]
+            stream = "" if stream_index == WHOLE else self._streams[stream_index]
             content = spool.unpack_block(kind, stream, count, bytes(self._text[offset + HEAD.size : stop]))
             offset = stop
             if content is not None:

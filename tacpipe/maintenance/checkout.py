@@ -47,7 +47,7 @@ class Known:
 
 
 def list_manifests(store: AnyStore) -> list[Known]:
-    """Return the present and past manifests of the store's roots, newest first; those that were collected are omitted."""
+    """Return the current and earlier manifests of the store's roots, newest first, without those that `gc` has removed."""
     by_label: dict[tuple[str, str], Known] = {}
     roots = store.roots.all()
     for root in roots:

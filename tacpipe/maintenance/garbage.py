@@ -60,10 +60,10 @@ class LiveObjects:
 
 
 def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
-    """Return the needed content; with ``lasting``, also replaced content that cannot be recomputed.
+    """Return the objects of the store that are needed; with ``lasting``, also replaced ones that cannot be recomputed.
 
-    Marks roots whose paths are missing, unless ``dry_run``. Raises `DamagedError` if a root or the manifest of an
-    ancestor is damaged, because its content is then unknown.
+    Roots whose paths are missing are marked, unless ``dry_run``. Raises `DamagedError` if a root or the manifest of an
+    ancestor is damaged, because the objects that it needs are then unknown.
     """
     needed, pending, replaced = LiveObjects(), [], []
     for run in store.leases.runs():  # runs are read before roots: a run that ends in between has written its root

@@ -161,7 +161,7 @@ def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> boo
 
 
 def repair(store: Store) -> Soundness:
-    """Return the soundness after recomputing missing objects of roots, or adopting them from dataset directories."""
+    """Restore missing objects from dataset directories or by recomputing them, and return the store's new soundness."""
     if not store.check():
         return Soundness(there=False)
     with store.at_work():

@@ -70,13 +70,12 @@ def push(
 ) -> Transferred:
     """Copy datasets to the store at ``remote``: shards, files, records, and the manifests of their ancestors.
 
-    With ``ancestors``, the ancestors' shards are copied, too. Existing objects in ``remote`` are compared by size, or
-    with ``verify`` by content, and replaced if they are damaged. A name there belongs to this project; with
-    ``project``, this project takes over the identity of the one with that name. Earlier pushes are retained as
-    snapshots.
+    With ``ancestors``, the ancestors' shards are also copied. Existing objects in ``remote`` are compared by size, or with
+    ``verify`` by content, and replaced if they are damaged. Each project has its own names there; with ``project``, this
+    project takes over the identity of the project with that name. Earlier pushes are retained as snapshots.
 
-    Raises `UsageError` if another dataset was pushed under the name in between, unless ``replace`` is set, and
-    `DamagedError` for a shard that is damaged here and cannot be recomputed.
+    Raises `UsageError` if another dataset was pushed under the name in the meantime, unless ``replace`` is set, and
+    `DamagedError` for a local shard that is damaged and cannot be recomputed.
     """
     target, transferred = named_store(remote), Transferred()
     for path in paths:

@@ -36,10 +36,10 @@ class _Candidate:
 
 
 def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterable[Manifest]) -> dict[str, set[str]]:
-    """Return the digests of manifests and pages among ``objects`` that must be retained, with all digests in them.
+    """Return the manifests and pages among ``objects`` that must be retained, as digest -> all digests in it.
 
-    These contain recordings or labels that are neither in ``named_manifests`` nor in another retained one. A damaged
-    object that may be a manifest or a page is retained with everything it names, because its content is unknown.
+    They contain recordings or labels that are neither in ``named_manifests`` nor in another retained manifest or page. A
+    damaged object that may be a manifest or a page is retained with everything it refers to, because its content is unknown.
     """
     covered = {possession for manifest in named_manifests for possession, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}

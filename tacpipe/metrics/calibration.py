@@ -217,10 +217,8 @@ def _means_by_step(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
 
 def _coverage_interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the bounds of the 95 % interval of coverage over recordings, by step and over all steps."""
-    covered, values = (
-        np.stack([np.append(getattr(recording, name), getattr(recording, name).sum()) for recording in recordings])
-        for name in ("covered", "values")
-    )
+    covered = np.stack([np.append(recording.covered, recording.covered.sum()) for recording in recordings])
+    values = np.stack([np.append(recording.values, recording.values.sum()) for recording in recordings])
     coverages = intervals.share_interval(covered, values)
     return _named_steps(coverages.low), _named_steps(coverages.high)
 
@@ -244,18 +242,18 @@ class Band:
 
 
 def measure_bands(rows: pd.DataFrame, group: str, cluster: str, baseline: str) -> dict[tuple[Any, str], Band]:
-    """Return the quality of each predictor's band for each ``group``, a column of targets or steps.
+    """Return the quality of each predictor's band by value of the column ``group`` and predictor.
 
     ``rows`` are those of `COVERAGE_FILE`: ``covered``, ``width`` and ``pinball`` of single values, or their sums
-    over ``values``. Intervals are over the groups in the column ``cluster``.
+    over ``values``. Intervals resample the groups in the column ``cluster``.
     """
     columns = ["covered", "width", "pinball", "values"]
     counted = rows.assign(values=rows.get("values", 1.0)).astype(dict.fromkeys(columns, float))
     sums = counted.groupby([group, "predictor", cluster])[columns].sum()
-    parts: dict[Any, pd.DataFrame] = {names: part.droplevel([0, 1]) for names, part in sums.groupby(level=[0, 1])}
+    tables: dict[Any, pd.DataFrame] = {keys: table.droplevel([0, 1]) for keys, table in sums.groupby(level=[0, 1])}
     bands = {}
-    for (key, predictor), by_cluster in parts.items():
-        reference = parts[key, baseline].loc[by_cluster.index]
+    for (key, predictor), by_cluster in tables.items():
+        reference = tables[key, baseline].loc[by_cluster.index]
         covered, values, pinball = (by_cluster[[name]].to_numpy() for name in ("covered", "values", "pinball"))
         count = float(values.sum())
         bands[key, str(predictor)] = Band(

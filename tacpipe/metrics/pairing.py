@@ -202,12 +202,13 @@ def rank(
     measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
 ) -> dict[str, Pair]:
     """Return the pairs of a model with each baseline that shares recordings with it, by name, lowest error first."""
-    pairs = {
-        name: compared_pair
-        for name, sums in baselines.items()
-        if (compared_pair := pair(measure, model, sums, clusters))
-    }
-    errors = {name: float(measure.error(compared_pair.totals[1][None])[0]) for name, compared_pair in pairs.items()}
+    pairs: dict[str, Pair] = {}
+    errors: dict[str, float] = {}
+    for name, sums in baselines.items():
+        baseline_pair = pair(measure, model, sums, clusters)
+        if baseline_pair is not None:
+            pairs[name] = baseline_pair
+            errors[name] = float(measure.error(baseline_pair.totals[1][None])[0])
     return {name: pairs[name] for name in sorted(pairs, key=lambda name: (np.isnan(errors[name]), errors[name]))}
 
 
@@ -269,24 +270,27 @@ def _swaps(clusters: int) -> AnyArray:
 
 
 def _paired_sums(model: Sums, reference: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
-    """Return the concatenated sums of a model and another predictor, (seed, cluster, part), and the clusters' names."""
+    """Return the concatenated sums of a model and a reference (seed, cluster, sum), and the names of the clusters.
+
+    A recording of the model is paired with the reference's sums of the same seed, or else with their mean over seeds.
+    """
     reference_sums: dict[str, list[AnyFloats]] = {}
     for (_, recording), errors in reference.items():
         reference_sums.setdefault(recording, []).append(errors)
     rows = []
     for (seed, recording), errors in model.items():
         if recording in reference_sums:
-            own = reference.get((seed, recording))
-            paired = np.mean(reference_sums[recording], axis=0) if own is None else own
-            rows.append((seed, recording, errors, paired))
+            same_seed = reference.get((seed, recording))
+            paired = np.mean(reference_sums[recording], axis=0) if same_seed is None else same_seed
+            rows.append((seed, recording, np.concatenate([errors, paired])))
     if not rows:
         return np.zeros((0, 0, 0)), []
-    repeats = _repeat_index([(seed, recording) for seed, recording, *_ in rows])
-    units = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
-    cluster_index = {name: index for index, name in enumerate(sorted(set(units)))}
-    sums = np.zeros((max(repeats.values()) + 1, len(cluster_index), 2 * len(rows[0][2])))
-    cells = np.array([repeats[seed] for seed, *_ in rows]), np.array([cluster_index[name] for name in units])
-    np.add.at(sums, cells, np.array([np.concatenate([first, second]) for _, _, first, second in rows]))
+    repeats = _repeat_index([(seed, recording) for seed, recording, _ in rows])
+    row_clusters = [clusters[recording] if clusters else recording for _, recording, _ in rows]
+    cluster_index = {name: index for index, name in enumerate(sorted(set(row_clusters)))}
+    sums = np.zeros((max(repeats.values()) + 1, len(cluster_index), len(rows[0][2])))
+    cells = np.array([repeats[seed] for seed, *_ in rows]), np.array([cluster_index[name] for name in row_clusters])
+    np.add.at(sums, cells, np.array([row_sums for *_, row_sums in rows]))
     return sums, list(cluster_index)
 
 

@@ -165,9 +165,10 @@ class _Layer(torch.autograd.Function):
     def backward(
         ctx: Any, by_states: Tensor | None, by_hidden: Tensor | None, by_cell: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        """Return the gradients of the arguments of `forward`, from those of its three results; None for those not needed.
+        """Return the gradients of the arguments of `forward`, given the gradients of its three results.
 
-        Steps are processed in blocks from the last to the first, so that arrays of a block stay in the cache.
+        A gradient that is not needed is None. Steps are processed in blocks from the last to the first, so that the arrays
+        of a block stay in the cache.
         """
         from_input, from_state, step_inputs, gates, cells, tanhs = ctx.saved_tensors
         steps, windows, size = tanhs.shape

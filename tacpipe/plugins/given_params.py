@@ -46,8 +46,8 @@ def build(
 ) -> Any:
     """Return the params of stage ``name``.
 
-    Defaults are overridden by the file, the preset, ``--set`` and options, in this order. Raises `UsageError` for
-    unknown names, invalid values, params of another kind than the chosen one, and invalid combinations.
+    Defaults are overridden by the file, the preset, ``--set`` and options, in this order. Raises `UsageError` for unknown
+    names, invalid values, params of an architecture other than the chosen one, and invalid combinations.
     """
     file_settings = [] if file is None else _from_file(file, block or name, required=block is not None)
     option_settings = [_from_set(name, text) for text in sets]
@@ -59,9 +59,8 @@ def build(
     values: dict[str, Any] = {}
     tag_name = params_of.tag(stage)
     for setting in (*file_settings, *preset_settings, *option_settings):
-        if setting.key != tag_name or setting.value in params_of.choices(
-            kind, setting.key
-        ):  # other values were overridden
+        is_overridden = setting.key == tag_name and setting.value not in params_of.choices(kind, setting.key)
+        if not is_overridden:
             values[setting.key] = _convert_setting(stage, kind, setting, values)
     try:
         params = kind(**values)

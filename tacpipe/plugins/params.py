@@ -193,14 +193,14 @@ def with_current_names(stage: str, values: StoredParams) -> StoredParams:
 
 
 def read(union: Any, values: StoredParams, place: str) -> Any:
-    """Return the params in a model's configuration, as a dataclass or one of a ``union``.
+    """Return the params ``values`` of a model's configuration as a dataclass, one of the members of ``union``.
 
     The configuration may be of an older version: missing fields get their default, removed fields are ignored, and only
     types are checked, because ranges and choices may have changed. Raises `TacpipeError`, which starts with ``place``,
-    for a value of another type and for an unknown tag.
+    for a value of the wrong type and for an unknown tag.
     """
     members = _members(union)
-    kind, current = _current(members, values)
+    kind, current_values = _current(members, values)
     architectures.check_installed(union, values, kind)
     if kind is None:
         name = _tag_name(members)
@@ -209,12 +209,12 @@ def read(union: Any, values: StoredParams, place: str) -> Any:
         raise TacpipeError(f"{place}: {name} is {tag_text}; it must be one of {', '.join(allowed)}.")
     architectures.warn_of_version(values, kind)
     annotations = fields_of.hints(kind)
-    fitted = {
+    converted = {
         name: _convert_type(value, annotations[name], name, place)
-        for name, value in current.items()
+        for name, value in current_values.items()
         if name in annotations
     }
-    return kind(**fitted)
+    return kind(**converted)
 
 
 def _convert_type(value: Any, annotation: Any, name: str, place: str) -> Any:

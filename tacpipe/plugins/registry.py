@@ -108,12 +108,13 @@ def provider_of(group: str, name: str) -> Package | None:
 @functools.cache
 def plugin_packages() -> dict[str, Path]:
     """Return the entry-point file of each installed package with plug-ins, by package name."""
-    return {
-        package.name: file
-        for group, points in installed().items()
-        for name, (_, file) in points.items()
-        if (package := provider_of(group, name)) is not None
-    }
+    files = {}
+    for group, targets in installed().items():
+        for name, (_, file) in targets.items():
+            package = provider_of(group, name)
+            if package is not None:
+                files[package.name] = file
+    return files
 
 
 def package_of_stage(name: str) -> str | None:

@@ -250,14 +250,15 @@ def stage(
     requirements: Requirements | None = None,
     as_given: Callable[[Any], bool] | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
-    """Declare the decorated function a stage. Its signature is kept. Raise ``version`` whenever its result changes.
+    """Return a decorator that makes a function a stage with the same signature.
 
-    ``headline`` is the file of the result (`tacpipe.metrics.headline`) that the command prints as a table. ``part``
-    runs and is keyed recording by recording, with the same params; its files become files of the result, and an
-    argument ``Parts`` contains its tables. ``first`` gives the preceding stages with their params. ``preview``
-    describes what ``discover`` and the stage would read from a source; ``guess`` returns a first layout for it;
-    ``why_unread`` explains which files of it are not read. ``requirements`` describe what recordings must contain.
-    ``as_given`` returns, depending on the params, whether recordings skip the stages of a ``Model``.
+    Increase ``version`` whenever the stage's result changes. ``headline`` is the file of the result
+    (`tacpipe.metrics.headline`) that the command prints as a table. ``part`` is a stage that runs and is cached by
+    recording, with the same params; its files become files of the result, and an argument ``Parts`` contains its tables.
+    ``first`` returns the preceding stages with their params. ``preview`` describes what ``discover`` and the stage would
+    read from a source; ``guess`` returns a first layout for it; ``why_unread`` explains why files of it are not read.
+    ``requirements`` describe what recordings must contain. ``as_given`` returns, depending on the params, whether
+    recordings skip the stages of a ``Model``.
     """
     return lambda function: Stage(
         function,

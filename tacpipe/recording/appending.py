@@ -53,21 +53,21 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     if events.num_rows:
         streams[EVENTS] = events.to_reader
     shards = {name: _store_shard(store, name, batches) for name, batches in sorted(streams.items())}
-    text = store.put(rig.text.encode(), durable=True).to_json()
+    stored_rig = store.put(rig.text.encode(), durable=True).to_json()
     entry: RecordingEntry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
-    files = {RIG: text}
+    files = {RIG: stored_rig}
     if any(stream.undecoded for stream in sealed.values()):  # a later driver may decode them
         with (spooled.folder / "bytes").open("rb") as spool:
             copy_spool = functools.partial(shutil.copyfileobj, spool)
             files[BYTES] = store.put_written(copy_spool, durable=True).to_json()
     stored_result: StoredResult = {"recordings": {"": entry}, "files": files}
-    identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
+    identity = keys.identity(ACQUIRE, VERSION, {"rig": stored_rig["digest"]}, {"spool": spooled.folder.name})
     provenance_entry: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - start_s, 4)),
         "irreplaceable": True,
     }
     store.commit(identity, stored_result, provenance_entry, durable=True)
-    path, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
+    path, rig_name = output.absolute(), f"rig-{stored_rig['digest'][:8]}.toml"
     names: list[str] = []  # names under which the recording was added; a retry appends another
 
     def add_recording() -> directory.DirectoryChange:
@@ -79,8 +79,8 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             return directory.DirectoryChange(current, may_lack=_other_paths(current, existing_name, rig_name))
         name = _free_name(spooled.header["recording"], recordings)
         updated = current or Manifest(ACQUIRE, VERSION)
-        updated = updated.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
-        updated = replace(updated, files=dict(sorted({**updated.files, rig_name: text}.items())))
+        updated = updated.with_recordings({name: Item(entry, None, {RIG: stored_rig["digest"]})})
+        updated = replace(updated, files=dict(sorted({**updated.files, rig_name: stored_rig}.items())))
         try:
             manifest_of.check_pages(updated, fresh=True)
             updated.content  # noqa: B018  (raises if a value cannot be written as JSON)

@@ -120,9 +120,9 @@ class CounterUnroller:
     def _unroll_rows(
         self, raw: Int64s, t_ns: Times, last_raw: int, last_seq: int, last_ns: int, *, first: bool
     ) -> UnrolledCounters:
-        """Unroll counters one by one, and classify each that is not the next: a gap, a repetition, a late sample, a reset.
+        """Unroll counters one by one, and classify each unexpected one as a gap, a repetition, a late sample or a reset.
 
-        ``last_…`` describe the previous sample; ``first``: there is none, and they are those of the first row.
+        ``last_…`` describe the previous sample. If ``first``, there is no previous sample, and they describe the first row.
         """
         seq, missing = np.zeros(len(raw), dtype=np.int64), np.zeros(len(raw), dtype=np.int64)
         duplicate, late, reset = (np.zeros(len(raw), dtype=bool) for _ in range(3))
@@ -252,7 +252,7 @@ class LinkReader:
         return replace(batch, events=batch.events + final_events)
 
     def _batch(self, runs: Sequence[FrameRun], losses: Sequence[FramingLoss]) -> Batch:
-        """Return the samples and faults of new frames and framing losses, without the samples that are duplicates."""
+        """Return the samples of new frames, without duplicates, and the faults of the frames and of framing losses."""
         pairs = ((run, self.sensor.decode(run.frames)) for run in runs)
         decoded = [(run, samples) for run, samples in pairs if len(samples)]
         stamps = [run.t_ns if samples.rows is None else run.t_ns[samples.rows] for run, samples in decoded]

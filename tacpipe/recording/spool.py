@@ -294,15 +294,15 @@ class Spooled:
                     self._add_damage(start, next_start - start)
                     start = next_start
                     continue
-                _, _, kind, number, _, count, size = HEAD.unpack_from(content, start)
-                if (requested is None or number == requested) and number < len(self.streams):
+                _, _, kind, stream_index, _, count, size = HEAD.unpack_from(content, start)
+                if (requested is None or stream_index == requested) and stream_index < len(self.streams):
                     body = content[start + HEAD.size : start + HEAD.size + size]
-                    entry = unpack_block(kind, self.streams[number], count, body)
+                    entry = unpack_block(kind, self.streams[stream_index], count, body)
                     if entry is None:
                         self._add_damage(start, stop - start)
                     else:
-                        yield self.streams[number], entry
-                elif number == WHOLE:
+                        yield self.streams[stream_index], entry
+                elif stream_index == WHOLE:
                     entry = unpack_block(kind, "", count, content[start + HEAD.size : start + HEAD.size + size])
                     self._notes += [entry] if isinstance(entry, StreamNote) else []
                 start = stop

@@ -77,7 +77,7 @@ def _spec_markup(spec: Any) -> Markup:
 
 
 def _pack_spec(spec: Any) -> Any:
-    """Return a specification with its data by column: constant columns once, texts by their index.
+    """Return a chart specification with its data stored by column: constants once, texts as indices.
 
     >>> _pack_spec({"data": {"values": [{"a": 1, "b": "x"}, {"a": 2, "b": "x"}]}})
     {'data': {'rows': 2, 'columns': {'a': [1, 2], 'b': {'of': ['x'], 'at': 0}}}}

@@ -23,16 +23,16 @@ CLAUSES = {
 
 
 def sentence(context: Context) -> tuple[str, str]:
-    """Return a sentence about the best method and its gain over the best baseline, and the verdict; two "" without methods.
+    """Return a sentence about the best method and its gain over the best baseline, and the verdict.
 
-    The verdict is `headline.UNCLEAR` if those of parts or targets differ.
+    Both are empty if there are no methods. The verdict is `headline.UNCLEAR` if parts or targets have different verdicts.
     """
     clauses: list[str] = []
     verdicts: list[str] = []
     last_name, last_finding = "", ("", "")
-    for part, compared in context.parts.items():
+    for part, comparisons in context.parts.items():
         method = context.winner(part)
-        rows = [(comparison, row) for comparison in compared if (row := context.row(comparison, method)) is not None]
+        rows = [(comparison, row) for comparison in comparisons if (row := context.row(comparison, method)) is not None]
         if not rows or method is None:
             continue
         # parts of other splits or timelines are folded
@@ -53,9 +53,9 @@ def sentence(context: Context) -> tuple[str, str]:
 
 
 def first_chart(context: Context) -> Chart | None:
-    """Return the best methods and baselines with their intervals, one panel per question, or None without methods.
+    """Return a chart of the best methods and baselines with their intervals, or None if there are no methods.
 
-    With more than two questions, each panel has only the best method and the best baseline.
+    It has one panel per question. With more than two questions, each panel has only the best method and baseline.
     """
     dots: list[Dot] = []
     levels: dict[str, float] = {}
@@ -91,9 +91,9 @@ def first_chart(context: Context) -> Chart | None:
 
 
 def first_table(context: Context) -> Table | None:
-    """Return one row per best method and the best baseline, or None without methods.
+    """Return a table with the best methods and baselines, or None if there are no methods.
 
-    With several targets, it has one row of the best method per target.
+    With several targets, the table has one row per target, for its best method.
     """
     parts = dict(list(context.parts.items())[:2])
     if not any(comparison.models for compared in parts.values() for comparison in compared):
@@ -102,15 +102,13 @@ def first_table(context: Context) -> Table | None:
     if len(targets) > 1:
         return _table_by_target(context, parts, targets)
     first_comparisons = [compared[0] for compared in parts.values()]
-    names = list(dict.fromkeys(row.name for comparison in first_comparisons for row in _leaders(comparison)))[
-        : MAX_ROWS - 2
-    ]
-    baselines = [row.name for first in first_comparisons for row in [first.best_baseline] if row]
-    baselines += [
+    leaders = [row.name for comparison in first_comparisons for row in _leaders(comparison)]
+    names = list(dict.fromkeys(leaders))[: MAX_ROWS - 2]
+    best_baselines = [first.best_baseline.name for first in first_comparisons if first.best_baseline]
+    references = [
         row.name for first in first_comparisons for row in first.of("baseline") if row.name == first.measure.reference
     ]
-    baselines = list(dict.fromkeys(baselines))
-    baselines = baselines[: MAX_ROWS - len(names)]
+    baselines = list(dict.fromkeys(best_baselines + references))[: MAX_ROWS - len(names)]
     single = len(first_comparisons) == 1
     heads, kinds = [""], dict[int, str]()
     rows: list[Sequence[str | Cell]] = []

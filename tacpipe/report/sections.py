@@ -93,14 +93,15 @@ PICKED = (
 
 
 def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequence[Dataset], traces: int) -> Section:
-    """Return the section for the results of one task; ``extra_datasets`` are related ones that are not results.
+    """Return the section for the results of one task.
 
-    ``traces`` is the number of recordings that are drawn completely.
+    ``extra_datasets`` are related datasets that are not results; ``traces`` is the number of recordings that are drawn
+    completely.
     """
     runs = task.read(results)
     methods = grouped(runs, task.usual)
-    with_runs = {id(result.dataset) for result in runs}
-    bare = [result for result in results if id(result) not in with_runs]
+    evaluated = {id(run.dataset) for run in runs}
+    bare = [result for result in results if id(result) not in evaluated]  # results that only have metrics
     context = Context(task, methods, engine.comparisons(task, methods), extra_datasets, bare, traces, runs)
     sentence, verdict = task.sentence(context) or screen.sentence(context)
     bare_folds = [fold for number, result in enumerate(bare, 1) for fold in metric_folds(result, number, len(bare))]
@@ -240,9 +241,14 @@ def recording_folds(context: Context) -> list[Fold]:
 
 
 def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.Block]:
-    """Return a chart of a method's gains over the baseline by recording, if there are enough, and a table of its errors."""
+    """Return a chart of a method's gain over the baseline by recording, and a table of the recordings with the worst errors.
+
+    The chart is left out for three recordings or fewer.
+    """
     measure, question = comparison.measure, comparison.question
-    best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
+    best = next(
+        (baseline_cell for baseline_cell in comparison.of("baseline") if baseline_cell.name == row.baseline), None
+    )
     model_sums = pairing.add_by_key((name, sums) for (_, name), sums in row.method.sums(question).items())
     sums_by_run = best.method.sums(question, best.predictor) if best else {}
     baseline_sums = pairing.add_by_key((name, sums) for (_, name), sums in sums_by_run.items())
@@ -253,37 +259,41 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
     )
     gains = np.asarray(measure.gain(errors, baseline_errors), np.float64)
     worst_first = sorted(range(len(names)), key=lambda index: (np.isnan(errors[index]), -errors[index], names[index]))
-    wrong = [index for index in worst_first if errors[index] != 0]
+    with_errors = [index for index in worst_first if errors[index] != 0]
     digits = 1 if measure.name == "points" else 3
     rows: list[Sequence[str | Cell]] = []
-    for index in wrong[:RECORDINGS]:
+    for index in with_errors[:RECORDINGS]:
         name, gain = names[index], float(gains[index])
         values = [number(value) for value in measure.values(model_sums[name])]
-        base = number(measure.values(baseline_sums[name])[0]) if name in baseline_sums else Cell(NONE)
+        baseline_cell = number(measure.values(baseline_sums[name])[0]) if name in baseline_sums else Cell(NONE)
         gain_cell = Cell(blocks.signed(gain, digits), value=None if np.isnan(gain) else gain)
-        rows.append([Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, base, gain_cell])
-    parts: list[blocks.Block] = []
+        rows.append(
+            [Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, baseline_cell, gain_cell]
+        )
+    charts_of_gains: list[blocks.Block] = []
     defined = gains[~np.isnan(gains)]
     title = f"{question.where}: {row.name}"
     if len(defined) > 3 and measure.cluster == "recordings":
-        ranked = [index for index in np.argsort(-gains, kind="stable") if not np.isnan(gains[index])]
-        ranks = np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))
+        best_first = [index for index in np.argsort(-gains, kind="stable") if not np.isnan(gains[index])]
+        ranks = np.unique(np.linspace(0, len(best_first) - 1, min(len(best_first), DOTS)).astype(int))
         dots = [
-            {"x": float(place), "y": float(gains[index]), "name": row.name, "tip": names[index]}
-            for place, index in enumerate((ranked[rank] for rank in ranks), 1)
+            {"x": float(x), "y": float(gains[best_first[rank]]), "name": row.name, "tip": names[best_first[rank]]}
+            for x, rank in enumerate(ranks, 1)
         ]
         quantity = f"{measure.name} over {row.baseline}"
         spec = charts.scatter(dots, "recordings, the best first", quantity, level=("", 0.0), legend=False, height=170)
-        parts.append(
+        charts_of_gains.append(
             Chart(f"{title}, better than {row.baseline} on {int((defined > 0).sum())} of {len(defined)}", spec)
         )
-    about = f"the {RECORDINGS} worst of {len(names):,}" if len(wrong) > RECORDINGS else "the worst first"
-    without_errors = f"; {len(names) - len(wrong):,} of {len(names):,} have no error" if len(wrong) < len(names) else ""
+    about = f"the {RECORDINGS} worst of {len(names):,}" if len(with_errors) > RECORDINGS else "the worst first"
+    without_errors = (
+        f"; {len(names) - len(with_errors):,} of {len(names):,} have no error" if len(with_errors) < len(names) else ""
+    )
     baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
     heads = ["recording", *measure.columns, baseline_head, measure.name]
     if not rows:
-        return [*parts, SmallPrint(f"{title}: none of the {len(names):,} has an error.")]
-    return [*parts, blocks.table(f"{title}, {about}{without_errors}", heads, rows)]
+        return [*charts_of_gains, SmallPrint(f"{title}: none of the {len(names):,} has an error.")]
+    return [*charts_of_gains, blocks.table(f"{title}, {about}{without_errors}", heads, rows)]
 
 
 def run_folds(context: Context) -> list[Fold]:

@@ -128,9 +128,9 @@ class ByteFramer:
         return stop
 
     def _chain(self, offset: int, limit: int | None = None) -> tuple[list[Span], int, bool]:
-        """Return the consecutive good frames from ``offset`` on as spans, their end, and whether no frame can start there.
+        """Return the consecutive good frames from ``offset`` on, the offset after them, and whether a bad frame follows.
 
-        A span is (start, size, count). ``limit`` is the largest number of frames, by default unlimited.
+        Frames are spans (start, size, count). ``limit`` is the maximum number of frames.
         """
         spans: list[Span] = []
         size_of_text = len(self._text.data)

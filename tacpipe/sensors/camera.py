@@ -75,14 +75,14 @@ def unpack_settings(packet: bytes) -> dict[str, Any] | None:
 
 
 def options(data: Chunks) -> list[Options]:
-    """Return a list with the options that a camera's packets report; it is empty before the first frame."""
+    """Return a list with the options that a camera's packets report, or an empty list if they contain no valid frame."""
     packets = data.packets()
-    settings = next((values for packet in packets if (values := unpack_settings(packet)) is not None), None)
-    frames = (frame for packet in packets if (frame := unpack_frame(packet)) is not None)
-    shape = next((shape for frame in frames if (shape := read_shape(frame.content)) is not None), None)
+    settings = next((values for values in map(unpack_settings, packets) if values is not None), {})
+    frames = filter(None, map(unpack_frame, packets))
+    shape = next((shape for shape in (read_shape(frame.content) for frame in frames) if shape is not None), None)
     if shape is None:
         return []
-    reported: dict[str, Any] = {name: settings[name] for name in STATED if name in settings} if settings else {}
+    reported: dict[str, Any] = {name: settings[name] for name in STATED if name in settings}
     return [{**shape._asdict(), **reported}]
 
 

@@ -83,7 +83,7 @@ class ScanFramer:
         return [FrameRun(data[rows_of_scans].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
 
     def _can_frames(self, chunks: Chunks) -> tuple[Bytes, Times, list[FramingLoss]]:
-        """Return the CAN frames of this board (frame, 13), their arrivals, and malformed packets as losses."""
+        """Return the CAN frames of this board (frame, 13), their arrivals in ns, and malformed packets as losses."""
         is_valid = (chunks.size > 0) & (chunks.size % CAN == 0)  # some adapters return several CAN frames at once
         losses = [
             FramingLoss(int(at_ns), MALFORMED, 0, int(size))
@@ -92,9 +92,9 @@ class ScanFramer:
         data = np.frombuffer(chunks.data, np.uint8)
         frames = data[np.repeat(is_valid, chunks.size)].reshape(-1, CAN)
         t_ns = np.repeat(chunks.t_ns[is_valid], chunks.size[is_valid] // CAN)
-        ours = np.isin(_identifier(frames), self._identifiers)
-        self.account.framed += int((~ours).sum()) * CAN
-        return frames[ours], t_ns[ours], losses
+        is_from_board = np.isin(_identifier(frames), self._identifiers)
+        self.account.framed += int((~is_from_board).sum()) * CAN
+        return frames[is_from_board], t_ns[is_from_board], losses
 
     def _positions(self, frames: Bytes) -> Int64s:
         """Return the position of each CAN frame in its scan (frame,), or -1 if it is malformed."""

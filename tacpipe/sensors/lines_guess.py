@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,11 +46,11 @@ def guess_options(data: Chunks) -> list[Options]:
     if len(texts) < MIN_LINES:
         return []
     options: dict[str, OptionValue] = {}
-    total, bodies = _guess_sum(texts)
-    layout_and_cells = _split_cells(bodies)
-    if layout_and_cells is None:
+    checksum, bodies = _guess_sum(texts)
+    layout = _split_cells(bodies)
+    if layout is None:
         return []
-    prefix, separator, suffix, decimal, cells, cell_rows = layout_and_cells
+    prefix, separator, suffix, decimal, cells, cell_rows = layout
     t_ns = t_ns[cell_rows]
     labels, words = _labels(cells)
     if words is None or len(words) < MIN_LINES:
@@ -71,7 +72,7 @@ def guess_options(data: Chunks) -> list[Options]:
     options |= {"suffix": suffix} if suffix else {}
     options |= {"missing": missing} if missing else {}
     options |= {"comments": comments} if comments else {}
-    options |= {"sum": total} if total else {}
+    options |= {"sum": checksum} if checksum else {}
     if sequence is not None:
         step = _step(numbers[:, sequence])
         column = column_names[sequence] if column_names else "count"
@@ -104,25 +105,25 @@ def _guess_sum(lines: Sequence[str]) -> tuple[dict[str, str | bool] | None, list
     Lines without the mark of the checksum are left out.
     """
     min_count = max(MIN_SHARE * len(lines), MIN_LINES)
-    marks = ["*"] if sum(bool(CHECKSUM.search(line)) for line in lines) >= min_count else [",", ";", "\t", " "]
-    for mark in marks:
-        parts = [line.rpartition(mark) for line in lines if mark in line]
-        if len(parts) < min_count:
+    separators = ["*"] if sum(bool(CHECKSUM.search(line)) for line in lines) >= min_count else [",", ";", "\t", " "]
+    for separator in separators:
+        split_lines = [line.rpartition(separator) for line in lines if separator in line]
+        if len(split_lines) < min_count:
             continue
         for digits in ("hex", "decimal"):
-            options = _sum_options(parts, mark, digits)
+            options = _sum_options(split_lines, separator, digits)
             if options is not None:
-                return options, [line.rpartition(mark)[0] for line in lines if mark in line]
+                return options, [line.rpartition(separator)[0] for line in lines if separator in line]
     return None, list(lines)
 
 
-def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) -> dict[str, str | bool] | None:
-    """Return the options with which nearly all declared checksums match, or None if there are none.
+def _sum_options(split_lines: Sequence[tuple[str, str, str]], mark: str, digits: str) -> dict[str, str | bool] | None:
+    """Return the options of a checksum that nearly all lines match, or None if there are none.
 
-    ``parts`` are (body, mark, checksum) of each line.
+    ``split_lines`` contains body, mark and checksum of each line; ``digits`` is the notation of the checksum.
     """
     base = 16 if digits == "hex" else 10
-    words = [word.strip() for _, _, word in parts]
+    words = [word.strip() for _, _, word in split_lines]
     try:
         declared = np.array(
             [int(word, base) if not set(word) - set("0123456789abcdefABCDEF") else -1 for word in words]
@@ -131,7 +132,7 @@ def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) 
         return None
     if len(np.unique(declared)) < MIN_LINES:  # a constant, or a column that hardly changes
         return None
-    begins = list(dict.fromkeys(["", *(body[:1] for body, _, _ in parts[:1] if not body[:1].isalnum())]))
+    begins = list(dict.fromkeys(["", *(body[:1] for body, _, _ in split_lines[:1] if not body[:1].isalnum())]))
     for kind in SUM_KINDS:
         if digits == "hex" and max(map(len, words)) > 2 * layout.SUMS[kind][1]:
             continue
@@ -139,7 +140,7 @@ def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) 
             for mark_summed in (False, True):
                 total = LineSum(kind=kind, mark=mark, begin=begin, mark_summed=mark_summed)  # type: ignore[arg-type]
                 end = mark if mark_summed else ""
-                texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in parts]
+                texts = [(body.removeprefix(begin) + end).encode("ascii", "replace") for body, _, _ in split_lines]
                 if (line_sums(texts, total) == declared).mean() >= MIN_MATCHING:
                     options: dict[str, str | bool] = {"kind": kind, "mark": mark, "digits": digits, "begin": begin}
                     options["mark_summed"] = mark_summed
@@ -148,30 +149,38 @@ def _sum_options(parts: Sequence[tuple[str, str, str]], mark: str, digits: str) 
     return None
 
 
-def _split_cells(lines: Sequence[str]) -> tuple[str, str, str, str, list[list[str]], Int64s] | None:
-    """Return the layout that most lines have, and the cells of these lines, or None if no separator fits most lines.
+class _CellLayout(NamedTuple):
+    """The layout that most lines have, and the cells of these lines."""
 
-    The layout is prefix, separator, suffix and decimal mark; cells are (line, cell), followed by the indices of the
-    lines.
-    """
+    prefix: str
+    separator: str
+    suffix: str
+    decimal: str
+    cells: list[list[str]]  # (line, cell)
+    rows: Int64s  # (line,), index of each of these lines
+
+
+def _split_cells(lines: Sequence[str]) -> _CellLayout | None:
+    """Return the layout that most lines have, with their cells, or None if no separator fits most lines."""
     prefix = _common_prefix(lines)
     bodies = [line.removeprefix(prefix) for line in lines]
     for separator in SEPARATORS:
         decimal = "."
         if separator != "," and any(DECIMAL_COMMA.search(line) for line in bodies):
             decimal = ","
-        parts = [line.split(separator) if separator != " " else line.split() for line in bodies]
-        width, count = Counter(map(len, parts)).most_common(1)[0]
+        words_by_line = [line.split(separator) if separator != " " else line.split() for line in bodies]
+        width, count = Counter(map(len, words_by_line)).most_common(1)[0]
         if count < MIN_SHARE * len(lines) or (width == 1 and separator != " "):
             continue
-        rows = [row for row, words in enumerate(parts) if len(words) == width]
-        cells = [[word.strip() for word in parts[row]] for row in rows]
+        rows = [row for row, words in enumerate(words_by_line) if len(words) == width]
+        cells = [[word.strip() for word in words_by_line[row]] for row in rows]
         suffix = ""
         if width > 1 and all(words[-1] == "" for words in cells):
             cells, suffix = [words[:-1] for words in cells], separator
         valid = [row for row, words in enumerate(cells) if _is_row(words, decimal)]
         if len(valid) >= MIN_SHARE * len(lines):
-            return prefix, separator, suffix, decimal, [cells[row] for row in valid], np.array(rows)[valid]
+            valid_cells = [cells[row] for row in valid]
+            return _CellLayout(prefix, separator, suffix, decimal, valid_cells, np.array(rows)[valid])
     return None
 
 
@@ -188,7 +197,8 @@ def _common_prefix(lines: Sequence[str]) -> str:
 
 def _is_row(words: Sequence[str], decimal: str) -> bool:
     """Return whether every cell is a number or a missing value, with or without label, and at least one is a number."""
-    words_without_labels = [(match[2] if (match := LABEL.fullmatch(word)) else word) for word in words]
+    matches = [LABEL.fullmatch(word) for word in words]
+    words_without_labels = [match[2] if match else word for match, word in zip(matches, words, strict=True)]
     numbers = [bool(NUMBER.fullmatch(word.replace(decimal, "."))) for word in words_without_labels]
     return any(numbers) and all(
         is_number or word in MISSING for is_number, word in zip(numbers, words_without_labels, strict=True)
@@ -196,11 +206,12 @@ def _is_row(words: Sequence[str], decimal: str) -> bool:
 
 
 def _labels(cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]] | None]:
-    """Return the label of each cell, or "", and the cells without labels.
+    """Return the label before each number of the first line, or "", and the cells (line, cell) without their labels.
 
-    The cells are None if too few lines have the labels of the first.
+    Lines with different labels are left out. The cells are None if too few lines remain.
     """
-    labels = [match[1] if (match := LABEL.fullmatch(word)) else "" for word in cells[0]]
+    matches = [LABEL.fullmatch(word) for word in cells[0]]
+    labels = [match[1] if match else "" for match in matches]
     if not any(labels):
         return labels, [list(words) for words in cells]
     labelled = [words for words in cells if all(map(str.startswith, words, labels))]
@@ -214,12 +225,12 @@ def _numbers(words: Sequence[Sequence[str]], decimal: str, missing: Sequence[str
 
     The numbers are None if a cell is not a number.
     """
-    plain = [["nan" if word in missing else word.replace(decimal, ".") for word in row] for row in words]
+    float_texts = [["nan" if word in missing else word.replace(decimal, ".") for word in row] for row in words]
     try:
-        numbers = np.array(plain, dtype=np.float64)
+        numbers = np.array(float_texts, dtype=np.float64)
     except (ValueError, OverflowError):
         return None, np.zeros(0, dtype=bool)
-    is_integer = [[bool(re.fullmatch(r"[+-]?\d+", word)) for word in row] for row in plain]
+    is_integer = [[bool(re.fullmatch(r"[+-]?\d+", text)) for text in row] for row in float_texts]
     return numbers, np.asarray(np.array(is_integer).all(axis=0))
 
 

@@ -98,7 +98,7 @@ class Lsl(Sensor):
         return unpacked is not None and bool((np.abs(unpacked[1]) < lsl.MAX_TIME_S).all())
 
     def _unpack(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
-        """Return correction, timestamps (sample,) in s and values (sample, channel), or None if there are no samples."""
+        """Return the clock correction in s, timestamps (sample,) in s and values (sample, channel); None without samples."""
         if packet[:1] == (TEXTS if self._is_text else NUMBERS) and len(packet) >= HEAD.size:
             _, correction, count = HEAD.unpack_from(packet)
             stop = HEAD.size + 8 * count

@@ -124,7 +124,7 @@ def are_valid(frames: Bytes) -> Bools:
 
 
 def parse(frame: bytes) -> PtsLayout:
-    """Return the layout of a frame, which includes its markers.
+    """Return the layout of a frame, given with its start and end markers.
 
     Raises `ValueError` for invalid tables: an offset outside of its block, an entry of a wrong kind or size, or blocks with
     different numbers of sensors or pillars.

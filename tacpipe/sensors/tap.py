@@ -81,27 +81,33 @@ class Tap(Sensor):
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return one sample per record, or per record with a grasp if only grasps are recorded."""
-        entries = [(row, line, json.loads(line)) for row, frame in enumerate(frames) for line in _lines(frame)]
-        entries = [entry for entry in entries if not self.grasp or "grasp" in entry[2]]
-        records = [record for _, _, record in entries]
+        rows, lines, records = [], [], []
+        for row, frame in enumerate(frames):
+            for line in _lines(frame):
+                record = json.loads(line)
+                if not self.grasp or "grasp" in record:
+                    rows.append(row)
+                    lines.append(line)
+                    records.append(record)
         if self.grasp:
             values: tuple[AnyArray, ...] = (self._grasps(records),)
         else:
-            texts = [[str(record.get("event", "")), line.decode()] for _, line, record in entries]
-            values = (np.array(texts, dtype=object).reshape(len(entries), 2), self._numbers(records))
+            texts = [[str(record.get("event", "")), line.decode()] for line, record in zip(lines, records, strict=True)]
+            values = (np.array(texts, dtype=object).reshape(len(records), 2), self._numbers(records))
         return Samples(
             values,
             seq=np.array([record["seq"] for record in records], dtype=np.int64) if self.counted else None,
             t_device_ns=np.array([record["t_ns"] for record in records], dtype=np.int64) if self.timed else None,
-            rows=np.array([row for row, _, _ in entries], dtype=np.int64),
+            rows=np.array(rows, dtype=np.int64),
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
-        """Return one packet per record: its text, or a record of its numbers if the text is empty."""
+        """Return one packet per sample: its text or, if that is empty, a JSON record of its numbers."""
         records: list[dict[str, Any]] = [{} for _ in range(len(samples))]
         for name, stamps in (("seq", samples.seq), ("t_ns", samples.t_device_ns)):
-            for record, stamp in zip(records, () if stamps is None else stamps.tolist(), strict=stamps is not None):
-                record[name] = stamp
+            if stamps is not None:
+                for record, stamp in zip(records, stamps.tolist(), strict=True):
+                    record[name] = stamp
         if self.grasp:
             for record, row in zip(records, samples.values[0].tolist(), strict=True):
                 record["grasp"] = {"g1": row[:3], "g2": row[3:6]}

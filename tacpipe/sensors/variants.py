@@ -55,7 +55,7 @@ def _flexitac(data: bytes) -> list[Options]:
 
 
 def _anyskin(data: bytes) -> list[Options]:
-    """Return the options of AnySkin for each number of magnetometers that the bytes suggest; if none, default options."""
+    """Return options of AnySkin for each number of magnetometers that the bytes suggest, or default options if none."""
     sizes = [distance - 2 for distance in distances(data, b"\r\n")]
     binary: list[Options] = [{"magnetometers": size // 16} for size in sizes if size and size % 16 == 0]
     lines = [line.split() for line in data.split(b"\n")[1:4] if _has_temperatures(line.split())]

@@ -205,10 +205,10 @@ def contact_intervals(
     starts, stops = runs(contact_mask(load, on, off))
     if not len(starts):
         return np.zeros((0, 2), dtype=np.int64)
-    separate = t_ns[starts[1:]] - t_ns[stops[:-1] - 1] > round(merge_s * 1e9)  # (contact - 1,)
-    starts, stops = starts[np.append(True, separate)], stops[np.append(separate, True)]
-    long = t_ns[stops - 1] - t_ns[starts] >= round(min_s * 1e9)
-    starts, stops = starts[long], stops[long]
+    is_separate = t_ns[starts[1:]] - t_ns[stops[:-1] - 1] > round(merge_s * 1e9)  # (contact - 1,)
+    starts, stops = starts[np.append(True, is_separate)], stops[np.append(is_separate, True)]
+    is_long = t_ns[stops - 1] - t_ns[starts] >= round(min_s * 1e9)
+    starts, stops = starts[is_long], stops[is_long]
     pad_ns = round(pad_s * 1e9)
     first = np.searchsorted(t_ns, t_ns[starts] - pad_ns, side="left")
     last = np.searchsorted(t_ns, t_ns[stops - 1] + pad_ns, side="right")

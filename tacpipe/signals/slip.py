@@ -161,17 +161,17 @@ def _trim(slip: Bools, smooth: Floats, level_count: float) -> Bools:
     starts, stops = runs(slip)
     free_from = np.append(0, stops)[: len(starts)]
     free_to = np.append(starts, len(slip))[1:]
-    for start, stop, lowest, highest in zip(starts, stops, free_from, free_to, strict=True):
-        before = float(np.median(smooth[max(lowest, start - LEVEL_ROWS) : start + 1]))
-        after = float(np.median(smooth[stop - 1 : min(highest, stop + LEVEL_ROWS)]))
-        sign = 1.0 if after >= before else -1.0
+    for start, stop, previous_stop, next_start in zip(starts, stops, free_from, free_to, strict=True):
+        level_before = float(np.median(smooth[max(previous_stop, start - LEVEL_ROWS) : start + 1]))
+        level_after = float(np.median(smooth[stop - 1 : min(next_start, stop + LEVEL_ROWS)]))
+        sign = 1.0 if level_after >= level_before else -1.0
         run = sign * smooth[start:stop]
-        first, last = (
-            _departure_row(run - sign * before, level_count),
-            _departure_row((sign * after - run)[::-1], level_count),
+        start_offset, stop_offset = (
+            _departure_row(run - sign * level_before, level_count),
+            _departure_row((sign * level_after - run)[::-1], level_count),
         )
-        if first is not None and last is not None:
-            trimmed[max(start + first, lowest) : min(stop - last, highest)] = True
+        if start_offset is not None and stop_offset is not None:
+            trimmed[max(start + start_offset, previous_stop) : min(stop - stop_offset, next_start)] = True
     return trimmed
 
 

@@ -84,10 +84,11 @@ def error_bound(
 def truth_table(
     t_ns: int, scene: GraspScene, sensed: Readings, estimate: tuple[Floats, Floats], moments_ns: Mapping[str, int]
 ) -> pa.Table:
-    """Return the stream ``truth``: gt_mf_… and gt_th_… for the fingers, then the columns of the object.
+    """Return the stream ``truth``: columns of the fingers (gt_mf_… and gt_th_…), then those of the object.
 
-    ``gt_expected_…`` is the mean in counts and ``gt_variance_…`` the variance in counts² of a reading given the geometry.
-    ``moments_ns`` are the times of contact, hold and release, each a column ``gt_…_ns``.
+    ``estimate`` is the mean in counts and the variance in counts² of a reading given the geometry, the columns
+    ``gt_expected_…`` and ``gt_variance_…``. ``moments_ns`` are the times of contact, hold and release, each a column
+    ``gt_…_ns``.
     """
     columns = [column for finger in range(len(biotac_sp.FINGERS)) for column in _finger(finger, scene, sensed)]
     columns += [(f"gt_position_{axis}_m", "m", "position", scene.placed.origin_m[i]) for i, axis in enumerate("xyz")]

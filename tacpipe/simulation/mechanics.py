@@ -119,32 +119,32 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     first = int((grasp.grip_n > 0).argmax())
     mass, rate = grasp.mass_kg, step_s / grasp.mass_kg
     damping = 2 * math.sqrt(STIFFNESS_N_M * mass)
-    yielding = 1 / (1 + rate * damping + rate * step_s * STIFFNESS_N_M)
-    limits, rises = grasp.limit_n, np.ones(rows) if rise_m is None else rise_m
+    implicit_factor = 1 / (1 + rate * damping + rate * step_s * STIFFNESS_N_M)
+    limits, heights_m = grasp.limit_n, np.ones(rows) if rise_m is None else rise_m
     sx = sz = vx = vz = 0.0  # displacement (x, z) by slip, and relative velocity (x, z)
-    borne = min(max(float(rises[first]) / TABLE_M, 0.0), 1.0)
+    load_fraction = min(max(float(heights_m[first]) / TABLE_M, 0.0), 1.0)
     ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
-    ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * borne / STIFFNESS_N_M
+    ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * load_fraction / STIFFNESS_N_M
     slipping = False
     pending: list[tuple[float, ...]] = []  # rows that are not in `moves` yet
     last = first  # number of rows in `moves`
-    for rise, pull_x, pull_z, limit in _python_rows(mass, acceleration_m_s2, limits, rises, first):
-        borne = min(max((rise + sz) / TABLE_M, 0.0), 1.0)
-        dx, dz = pull_x, pull_z * borne
+    for height_m, pull_x, pull_z, limit in _python_rows(mass, acceleration_m_s2, limits, heights_m, first):
+        load_fraction = min(max((height_m + sz) / TABLE_M, 0.0), 1.0)
+        dx, dz = pull_x, pull_z * load_fraction
         if not slipping:
-            vx = (vx - rate * (STIFFNESS_N_M * ex + dx)) * yielding
-            vz = (vz - rate * (STIFFNESS_N_M * ez + dz)) * yielding
+            vx = (vx - rate * (STIFFNESS_N_M * ex + dx)) * implicit_factor
+            vz = (vz - rate * (STIFFNESS_N_M * ez + dz)) * implicit_factor
             ex, ez = ex + step_s * vx, ez + step_s * vz
             fx, fz = -STIFFNESS_N_M * ex - damping * vx, -STIFFNESS_N_M * ez - damping * vz
             slipping = (ex * ex + ez * ez) * STIFFNESS_N_M**2 > limit * limit
         if slipping:
             free_x, free_z = vx - rate * dx, vz - rate * dz
-            speed, braked = (free_x**2 + free_z**2) ** 0.5, rate * KINETIC * limit
-            if speed <= braked:
+            speed, friction_step = (free_x**2 + free_z**2) ** 0.5, rate * KINETIC * limit
+            if speed <= friction_step:
                 slipping, vx, vz, fx, fz = False, 0.0, 0.0, dx, dz
                 ex, ez = -dx / STIFFNESS_N_M, -dz / STIFFNESS_N_M
             else:
-                vx, vz = free_x * (1 - braked / speed), free_z * (1 - braked / speed)
+                vx, vz = free_x * (1 - friction_step / speed), free_z * (1 - friction_step / speed)
                 fx, fz = -KINETIC * limit * free_x / speed, -KINETIC * limit * free_z / speed
                 sx, sz = sx + step_s * vx, sz + step_s * vz
                 if sx * sx + sz * sz > DROP_M**2:
@@ -157,7 +157,7 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     moves[last : last + len(pending)] = pending
     last += len(pending)
     if last < rows:
-        moves[last:, 2:6] = _fall(acceleration_m_s2[last:], rises[last:], (sx, sz), (vx, vz), step_s)
+        moves[last:, 2:6] = _fall(acceleration_m_s2[last:], heights_m[last:], (sx, sz), (vx, vz), step_s)
         moves[last:, 6] = 2
     return moves
 

@@ -54,12 +54,12 @@ TRIAL_NS = 120_000_000_000
 MASSES_KG = (0.20, 0.28, 0.36, 0.44, 0.52)  # five fills of a bottle
 GRIP_N = (4.0, 8.0)  # normal force of each finger
 FRICTION = (0.35, 0.60)  # mu_s
-RESERVE = 1.3  # smallest 2 mu_s N per weight: slip starts at 0.3 g or more, and kinetic friction carries the weight
+RESERVE = 1.3  # minimum 2 mu_s N / (m g): slip starts at 0.3 g or more, and kinetic friction still carries the weight
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
-HANDLING_STREAM = 3  # random numbers of a handling, next to those of the rig's devices and of cameras
+HANDLING_STREAM = 3  # part of the random seed of a handling; devices and cameras have other numbers
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
-MEMORY_BYTES = 1 << 24  # size of streams above which they move to disk
+MEMORY_BYTES = 1 << 24  # streams larger than this are spilled to disk
 PLAN_S, PLAN_POINT_S = 1.0, 0.02  # length of a plan, and the time between its points
 LOSS_S, SLIDE_S = 0.02, 0.04  # duration of a loss of grip, and of the overload after it
 
@@ -169,12 +169,12 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     """Simulate the scene of trial ``index``. It does not depend on the logging of its streams."""
     rng = np.random.default_rng([seed, index])
     approach_s, pause_s = rng.uniform(*APPROACH_S), rng.uniform(*PAUSE_S)
-    chance = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
-    protocol = chance if rig.protocol == "mixed" else rig.protocol
+    random_protocol = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
+    protocol = random_protocol if rig.protocol == "mixed" else rig.protocol
     course = None
     if rig.handling != handling.PLANNED:
-        own_rng = np.random.default_rng([seed, index, HANDLING_STREAM])
-        course = handling.draw_plan(rig.handling, protocol, rig.duration_s, approach_s + RAMP_S + pause_s, own_rng)
+        handling_rng = np.random.default_rng([seed, index, HANDLING_STREAM])
+        course = handling.draw_plan(rig.handling, protocol, rig.duration_s, approach_s + RAMP_S + pause_s, handling_rng)
         path = course.path
     elif rig.still:
         path = trajectory.rest(rig.duration_s)
@@ -201,8 +201,8 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
     if rng.random() < rig.grip_loss_probability:
         row = _draw_loss_row(load_n, grasp, path.rise_m, rig.grip_loss, rng)
         loss_ns = int(path.t_ns[row])
-        weaker = 1 - rig.grip_loss * _ease((path.t_ns - loss_ns) / 1e9 / LOSS_S)
-        grasp = mechanics.HeldObject(mass_kg, grasp.friction, grasp.grip_n * weaker, rig.lever_m)
+        remaining_grip = 1 - rig.grip_loss * _ease((path.t_ns - loss_ns) / 1e9 / LOSS_S)
+        grasp = mechanics.HeldObject(mass_kg, grasp.friction, grasp.grip_n * remaining_grip, rig.lever_m)
     rise_m = None if rig.still else path.rise_m
     contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
     skins = (taxels.draw_skin(rng), taxels.draw_skin(rng))
@@ -224,7 +224,7 @@ def touch(
 ) -> Floats:
     """Return the force on each taxel of finger 0 or 1 at ``true_ns`` (time, taxel, axis).
 
-    ``places_m`` (taxel, 2) are the taxels' places along the hand's x and z.
+    ``places_m`` (taxel, 2) are the taxels' positions along the hand's x and z.
     """
     contact = scene.contact
     rows = np.minimum(np.searchsorted(scene.path.t_ns, true_ns), len(scene.path.t_ns) - 1)
@@ -235,12 +235,12 @@ def touch(
         for j, skin in enumerate(scene.skins)
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
-    pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
-    late = at(taxels.lag(contact.normal_n[:, finger], trajectory.RATE_HZ))
+    shear = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))  # of both fingers
+    lagging_n = at(taxels.lag(contact.normal_n[:, finger], trajectory.RATE_HZ))
     fraction = taxels.fractions(scene.skins[finger], displacement, torque, places_m)
-    pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * fraction
+    normal = (1 - creep) * pressures[finger] + creep * lagging_n[:, None] * fraction
     columns = slice(finger * len(places_m), (finger + 1) * len(places_m))
-    return np.concatenate([pulled[:, columns] + taxels.bulge(pressed, places_m), pressed[:, :, None]], axis=2)
+    return np.concatenate([shear[:, columns] + taxels.bulge(normal, places_m), normal[:, :, None]], axis=2)
 
 
 def _measurement(
@@ -266,15 +266,16 @@ def _measurement(
 
 
 def _draw_grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a random grip force and friction that hold the weight, or with which ``load_n`` is ``effort`` of the limit.
+    """Return a random grip force in N and friction.
 
-    The grip is outside of `GRIP_N` if effort, mass and plan require it.
+    They hold the weight if ``effort`` is 0; otherwise the load ``load_n`` is ``effort`` times the friction limit. The grip
+    is outside of `GRIP_N` if effort, mass and plan require it.
     """
     if effort:
-        product = load_n / (2 * effort)
-        low, high = np.clip([product / GRIP_N[1], product / GRIP_N[0]], *FRICTION)
+        friction_n = load_n / (2 * effort)  # friction force of each finger
+        low, high = np.clip([friction_n / GRIP_N[1], friction_n / GRIP_N[0]], *FRICTION)
         friction = float(rng.uniform(low, high))
-        return product / friction, friction
+        return friction_n / friction, friction
     while True:
         grip_n, friction = float(rng.uniform(*GRIP_N)), float(rng.uniform(*FRICTION))
         if 2 * friction * grip_n >= RESERVE * mass_kg * mechanics.GRAVITY_M_S2:
@@ -284,18 +285,18 @@ def _draw_grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Gene
 def _draw_loss_row(
     load_n: Floats, grasp: mechanics.HeldObject, rise_m: Floats, loss: float, rng: np.random.Generator
 ) -> int:
-    """Return a random row for a loss of grip while the hand is lifted and after which the load exceeds friction.
+    """Return a random row for a loss of grip: the hand is lifted, and the load exceeds friction for `SLIDE_S` afterwards.
 
-    The load must exceed friction for `SLIDE_S` after the loss. If there is no such row, any row with a lifted hand is used.
+    If there is no such row, any row with a lifted hand is used.
     """
-    aloft = rise_m >= rise_m.max() / 2
+    is_lifted = rise_m >= rise_m.max() / 2
     start, stop = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
-    # number of earlier rows in which friction holds
-    sticking = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))
-    sliding = aloft.copy()
-    sliding[-stop:] = False
-    sliding[:-stop] &= sticking[stop:-1] == sticking[start : start - stop - 1]
-    return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
+    # for each row, the number of earlier rows in which the weakened grip still holds
+    holding_before = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))
+    slides = is_lifted.copy()
+    slides[-stop:] = False
+    slides[:-stop] &= holding_before[stop:-1] == holding_before[start : start - stop - 1]
+    return int(rng.choice(np.flatnonzero(slides if slides.any() else is_lifted)))
 
 
 def interpolation(scene: PickScene, true_ns: Times) -> Any:
@@ -321,7 +322,7 @@ def arm(scene: PickScene, true_ns: Times) -> Floats:
 
 
 def plans(scene: PickScene, start_ns: int, rate_hz: float) -> pa.Table:
-    """Return the plans that a controller sends at a rate, each of the next `PLAN_S`, up to the end of the trial."""
+    """Return the plans that a controller sends at ``rate_hz``. Each covers the next `PLAN_S`, up to the end of the trial."""
     sent_ns = np.arange(0, int(scene.path.t_ns[-1]), round(1e9 / rate_hz), dtype=np.int64)
     target_ns = sent_ns[:, None] + plan_points_ns()
     exists = target_ns <= scene.path.t_ns[-1]
@@ -352,20 +353,21 @@ def _truth(scene: PickScene, start_ns: int) -> Callable[[slice], pa.Table]:
         ]
         columns += _vector("gt_force_{}_n", "N", "force", contact.force_n[block])
         columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", acceleration_m_s2[block])
-        moved, speed = contact.displacement_m[block], contact.velocity_m_s[block]
-        columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
-        columns.append((schema.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
-        columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
-        columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
+        displacement_m, velocity_m_s = contact.displacement_m[block], contact.velocity_m_s[block]
+        distance_m, speed_m_s = np.linalg.norm(displacement_m, axis=1), np.linalg.norm(velocity_m_s, axis=1)
+        columns += _vector("gt_displacement_{}_m", "m", "position", displacement_m, "xz")
+        columns.append((schema.float_field("gt_displacement_m", "m", "position"), distance_m))
+        columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", velocity_m_s, "xz")
+        columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), speed_m_s))
         columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm[block]))
         columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad[block]))
-        mass = np.full(len(moved), scene.grasp.mass_kg)
-        columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
+        mass_kg = np.full(len(displacement_m), scene.grasp.mass_kg)
+        columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass_kg))
         columns.append((schema.label_field("gt_slip"), slip[block]))
         columns.append((schema.label_field("gt_dropped"), contact.dropped[block]))
         if scene.handling != handling.PLANNED:
-            touched = np.where(scene.has_contact[block], 0, -1).astype(np.int8)
-            columns.append((schema.label_field("gt_contact"), touched))
+            contact_label = np.where(scene.has_contact[block], 0, -1).astype(np.int8)
+            columns.append((schema.label_field("gt_contact"), contact_label))
         fields, values = zip(*columns, strict=True)
         return schema.stream(start_ns + scene.path.t_ns[block], values, fields)
 

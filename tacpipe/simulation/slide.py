@@ -165,7 +165,10 @@ def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig(
 
 
 def sensitivity(scene: SlideScene) -> tuple[Floats, Floats, Floats, float]:
-    """Return counts per newton (time, channel), d (time, channel), xi (channel,) in m, and the aperture's sigma in m."""
+    """Return each channel's counts per newton (time, channel), d (time, channel) and xi (channel,) in m, and sigma in m.
+
+    These are the symbols of the module's description; sigma is the width of the aperture.
+    """
     if scene.trial.sensor == "biotac":
         shape = (len(scene.true_ns), schema.ELECTRODES)
         gain, lean = (np.broadcast_to(values, shape) for values in (fingertip.gains(), fingertip.leans()))

@@ -232,8 +232,8 @@ class Look:
     def succeed(self, note: Note, head: Head, before: Iterable[str], now: Iterable[tuple[str, str, int]]) -> bool:
         """Update a valid note after a change of the dataset; return False if that is not safe.
 
-        ``before`` are the paths that the dataset no longer names, or names with other content, and ``now`` path, digest
-        and size of the new content. Objects of the old content stay in the note until everything is checked again.
+        ``before`` are the paths that were removed or changed, and ``now`` path, digest and size of the new content. Objects
+        of the old content stay in the note until everything is checked again.
         """
         directory_state = _state(self._directory)
         if directory_state is None:

@@ -33,12 +33,12 @@ class RootProject(TypedDict):
 class WrittenManifest(TypedDict):
     """A current or previous manifest of a path."""
 
-    manifest: str  # digest
+    manifest: str  # digest of the manifest
     written_s: NotRequired[int]  # seconds of UTC since 1970
 
 
 class EarlierManifest(WrittenManifest):
-    """A manifest that a path held before."""
+    """A previous manifest of a path."""
 
     lasting: bool  # whether it is remembered forever
 
@@ -48,14 +48,14 @@ class Root(WrittenManifest):
 
     path: str
     kind: str
-    previous: NotRequired[str | None]  # digest of the manifest before
+    previous: NotRequired[str | None]  # digest of the previous manifest
     history: NotRequired[list[EarlierManifest]]  # newest first
-    key: NotRequired[str]  # the run that produced the manifest, or the key of what was labelled
-    pushed: NotRequired[list[str]]  # manifests of this path that went to other stores, newest first
+    key: NotRequired[str]  # key of the run that produced the manifest, or whose recordings were labelled
+    pushed: NotRequired[list[str]]  # digests of this path's manifests that were pushed to other stores, newest first
     project: NotRequired[RootProject]
-    missing_since_s: NotRequired[int]  # time when the path first could not be reached
-    output: NotRequired[bool]  # whether a command wrote it with the bucket as its store
-    number: NotRequired[int]  # version that it was read from in a store without locks; it is not stored
+    missing_since_s: NotRequired[int]  # UTC time in s at which the path was first missing
+    output: NotRequired[bool]  # whether a command wrote the dataset with a bucket as its store
+    number: NotRequired[int]  # version of the file in a store without locks; it is not stored
 
 
 class Roots:
@@ -179,8 +179,9 @@ class Roots:
 
 def name_of(kind: str, name: str, project: str = "") -> str:
     """Return the digest that is the file name of a root."""
-    parts: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
-    return digest(parts)
+    if kind == ABSOLUTE:
+        return digest(name)
+    return digest([kind, project, name] if project else [kind, name])
 
 
 def encoded(root: Root) -> bytes:

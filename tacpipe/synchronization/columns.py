@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tacpipe.io.spill import MappedArrays
     from tacpipe.signals.kinematics import SignContinuation
 
-MEDIAN_NS = 10_000_000  # half width of a median filter: its full width has eight readings at 400 Hz
+MEDIAN_NS = 10_000_000  # half the width of a median filter, whose full width contains eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
 GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
 
@@ -51,9 +51,10 @@ class GridColumns:
         *,
         hold_values: bool,
     ) -> None:
-        """Prepare the columns. ``exact`` contains the row of each grid point, if the stream has a sample at all of them.
+        """Prepare the columns.
 
-        ``storage`` may contain the times of stream and grid.
+        ``exact`` contains the row of each grid point, or is None if a grid point has no sample. ``storage`` may contain the
+        times of stream and grid.
         """
         from tacpipe.io.columns import RowRanges
 
@@ -86,9 +87,9 @@ class GridColumns:
             self._storage.release()
 
     def read(self, points: slice) -> list[GridColumn]:
-        """Return fields and values of the channels at a range of grid points, and of the masks.
+        """Return fields and values of the channels and masks at a range of grid points.
 
-        Ground truth has no masks. Each range follows that of the previous call.
+        Ranges must be consecutive. Ground truth has no masks.
         """
         at_ns, t_ns = self._grid_ns[points], self._stream.t_ns
         first = max(0, int(t_ns.searchsorted(at_ns[0] - ONLINE_MEDIAN_NS)) - 1)
@@ -114,7 +115,7 @@ def _channels(
     """Return field and values of each channel on the grid, in the order of the stream.
 
     ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated. ``signs`` continues
-    those of quaternions, by interpolation. Raises `TacpipeError` if a quaternion lacks a component.
+    the signs of quaternions from the previous call. Raises `TacpipeError` if a quaternion lacks a component.
     """
     from tacpipe.signals.kinematics import SignContinuation
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
@@ -129,13 +130,13 @@ def _channels(
         nearest = nearest_rows(stream.t_ns, grid_ns)
         for name in groups.pop("nearest"):
             grid_columns[name] = _channel_at_rows(stream, name, nearest, "nearest")
-    used = bracketing_rows(stream.t_ns, grid_ns)
+    bracketing = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         interpolation = method.partition(" ")[0]
         if interpolation == "slerp":
-            parts = [stream.columns.schema.field(name) for name in members]
-            members = [members[i] for i in streams.quaternion_order(stream.name, parts)]
-        rows = slice(None) if interpolation == "median" else used
+            components = [stream.columns.schema.field(name) for name in members]
+            members = [members[i] for i in streams.quaternion_order(stream.name, components)]
+        rows = slice(None) if interpolation == "median" else bracketing
         values = _interpolate_samples(
             stream, members, interpolation, grid_ns, rows, signs.setdefault(method, SignContinuation())
         )
@@ -173,29 +174,29 @@ def _channel_at_rows(stream: TimedStream, name: str, rows: Indices, interpolatio
 
 
 def _interpolate_samples(
-    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, used: Any, signs: SignContinuation
+    stream: TimedStream, names: list[str], interpolation: str, grid_ns: Times, rows: Any, signs: SignContinuation
 ) -> Floats:
-    """Return the values of channels at grid points (grid, channel), interpolated from the rows ``used``.
+    """Return the values of channels at grid points (grid, channel), interpolated from the samples in ``rows``.
 
-    ``signs`` continues those of a quaternion.
+    ``signs`` continues the sign of a quaternion from the previous call.
     """
     import numpy as np
 
     from tacpipe.signals.resampling import linear, median_around, slerp
 
-    t_ns = stream.t_ns[used]
-    values = np.stack([stream.values(name)[used] for name in names], axis=1)  # (time, channel)
+    t_ns = stream.t_ns[rows]
+    values = np.stack([stream.values(name)[rows] for name in names], axis=1)  # (time, channel)
     if interpolation == "slerp":
-        return slerp(t_ns, signs.apply(stream.first_row + used, values.astype(np.float64)), grid_ns)
+        return slerp(t_ns, signs.apply(stream.first_row + rows, values.astype(np.float64)), grid_ns)
     if interpolation == "median":
         return median_around(t_ns, values, grid_ns, MEDIAN_NS)
     return linear(t_ns, values, grid_ns)
 
 
-def _to_column(kind: pa.Field, column: Floats) -> GridColumn:
+def _to_column(field: pa.Field, values: Floats) -> GridColumn:
     import numpy as np
 
-    return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
+    return field, np.ascontiguousarray(values, dtype=field.type.to_pandas_dtype())
 
 
 def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
@@ -213,10 +214,7 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
 
 
 def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
-    """Return the time (grid,) in ns from each point to the arrival of the last sample that is used for it.
-
-    It is 0 if that sample arrived before.
-    """
+    """Return the time (grid,) in ns from each point to the arrival of its last sample, or 0 if that arrived before."""
     import numpy as np
 
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact

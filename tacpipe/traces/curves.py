@@ -47,9 +47,9 @@ def curves_of_streams(streams: Mapping[str, pa.Table]) -> list[Curves]:
 
 
 def curves_of_table(stream: str, table: pa.Table) -> list[Curves]:
-    """Return the curves of a stream, one for each quantity and unit in the order of its columns.
+    """Return the curves of a stream, a group per quantity and unit, in the order of its columns.
 
-    If rows contain several vibration readings, these are one curve per finger, at their own rate.
+    If rows contain several vibration readings, these become one curve per finger, at the rate of the readings.
     """
     if TIME not in table.column_names or table.num_rows < 2:
         return []

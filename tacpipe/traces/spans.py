@@ -79,9 +79,9 @@ def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[
             parts.append(span)
             continue
         touch = span._replace(start_ns=int(t_ns[rows[0]]), stop_ns=stop_ns(t_ns, int(rows[-1]) + 1))
-        before = span._replace(text=PADDING, stop_ns=touch.start_ns)
-        after = span._replace(text=PADDING, start_ns=touch.stop_ns)
-        parts += [part for part in (before, touch, after) if part.start_ns < part.stop_ns]
+        padding_before = span._replace(text=PADDING, stop_ns=touch.start_ns)
+        padding_after = span._replace(text=PADDING, start_ns=touch.stop_ns)
+        parts += [part for part in (padding_before, touch, padding_after) if part.start_ns < part.stop_ns]
     return parts
 
 

@@ -77,7 +77,7 @@ def taxels_from_table(stream: str, table: pa.Table) -> list[Taxels]:
 
 
 def _taxels_from_fields(stream: str, finger: str, table: pa.Table, fields: Sequence[pa.Field]) -> Taxels:
-    """Return the taxels of a finger with tactile columns ``fields``; ``finger`` is "" if the stream has only one."""
+    """Return the taxels of a finger with tactile columns ``fields``; ``finger`` is "" if the stream has only one finger."""
     ordered, axes = _order_by_taxel(fields)
     columns = [field.name for field in ordered]
     t_ns, values = table.column(TIME).to_numpy(), matrix(table, columns)

@@ -313,7 +313,7 @@ def _train_epochs(
 
 
 def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, followers: Followers) -> Line:
-    """Train for one epoch, append its line to the history and return it.
+    """Train for one epoch, append its metrics to the history and return them.
 
     The parts of the model that improved are copied to the best weights. Raises `TacpipeError` if a loss is not finite.
     """
@@ -343,11 +343,11 @@ def _train_epoch(run: _TrainingState, work: TrainingWork, schedule: Schedule, fo
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."
         )
-    improved = _improved_parts(work.ranks(line), [work.ranks(old) for old in run.history])
+    improved = _improved_parts(work.ranks(line), [work.ranks(earlier) for earlier in run.history])
     line["best"] = bool(improved)
     if improved:
-        now = run.model.state_dict().items()
-        run.best |= {name: value.detach().clone() for name, value in now if name.startswith(tuple(improved))}
+        state = run.model.state_dict().items()
+        run.best |= {name: value.detach().clone() for name, value in state if name.startswith(tuple(improved))}
     run.history.append(line)
     return line
 

@@ -80,10 +80,10 @@ class VideoScan:
 
 
 def scan(path: Path) -> VideoScan:
-    """Return the frames of a file's first video stream. Raises `TacpipeError` with the file's name if it cannot be read.
+    """Return timestamps, order and format of the frames in a file's first video stream.
 
     If a file has no presentation times and its codec may reorder frames, the frames are decoded once to find their
-    order.
+    order. Raises `TacpipeError` with the file's name if it cannot be read.
     """
     with _open_input(path) as container:
         video = _video_stream(path, container)

@@ -297,7 +297,7 @@ def _collect_tables(
     predictions: pa.Table | None = None,
     row: pa.Table | None = None,
 ) -> DrawnContents:
-    """Return the contents in the tables of a recording's streams; a table without times contributes only its row count.
+    """Return the drawn contents of a recording's streams. A single table without times contributes only its row count.
 
     ``predictions`` and ``row`` are those of `collect`.
     """
@@ -308,15 +308,15 @@ def _collect_tables(
     streams = split_tables(tables)
     truth = _truth(tables)
     fingers = taxels.taxels_from_streams(streams)
-    marks = [span for table in streams.values() for span in spans.label_spans(table)]
-    marks += [span for table in truth.values() for span in spans.label_spans(table)]
-    marks += _labelled_intervals(attributes, streams)
+    label_spans = [span for table in streams.values() for span in spans.label_spans(table)]
+    label_spans += [span for table in truth.values() for span in spans.label_spans(table)]
+    label_spans += _labelled_intervals(attributes, streams)
     if only_table is None:
-        missing = [
+        gap_spans = [
             span for stream, table in streams.items() if not _is_cloud(table) for span in spans.gaps(stream, table)
         ]
     else:
-        missing = spans.masked_gaps(only_table)
+        gap_spans = spans.masked_gaps(only_table)
     events = spans.events(tables[EVENTS]) if EVENTS in tables else []
     clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
@@ -329,8 +329,8 @@ def _collect_tables(
         curves.curves_of_streams(plotted),
         curves.curves_of_streams(truth),
         fingers,
-        marks,
-        missing,
+        label_spans,
+        gap_spans,
         events,
         curves.paths_of_streams(plotted),
         [points for stream, table in clouds.items() for points in _points(stream, table)],

@@ -299,7 +299,7 @@ def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, mon
     force(tmp_path / "run.xdf", rows=1000)
     expected = read(tmp_path / "run.xdf").streams["force"]
     monkeypatch.setattr(xdf_streams, "SPILL_ROWS", 64)
-    monkeypatch.setattr(xdf_streams, "PASSED_BYTES", mmap.PAGESIZE)
+    monkeypatch.setattr(xdf_streams, "RELEASE_BYTES", mmap.PAGESIZE)
     streams = read(tmp_path / "run.xdf").streams["force"]
     assert isinstance(streams, pa.RecordBatchReader)
     assert streams.read_all().equals(expected, check_metadata=True)

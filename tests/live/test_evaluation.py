@@ -121,7 +121,7 @@ def test_minus_zero_is_not_zero() -> None:
 def test_nothing_is_interpolated_over_a_gap_or_an_unusable_row() -> None:
     t_ns, values = np.arange(5) * 10, np.arange(5.0)[:, None]
     groups, usable = np.array([0, 0, 1, 1, 1]), np.array([True, True, True, False, True])
-    result = truth.at(t_ns, values, groups, usable, np.array([-1, 0, 4, 15, 20, 25, 40, 41]))[:, 0]
+    result = truth.interpolate(t_ns, values, groups, usable, np.array([-1, 0, 4, 15, 20, 25, 40, 41]))[:, 0]
     assert np.array_equal(result, [np.nan, 0, 0.4, np.nan, 2, np.nan, 4, np.nan], equal_nan=True)
 
 

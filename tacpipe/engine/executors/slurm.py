@@ -113,20 +113,20 @@ def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, conf
     """
     from dask_jobqueue import SLURMCluster
 
-    def configured(name: str, default: Any) -> Any:
+    def setting(name: str, default: Any) -> Any:
         value = config.get(f"{SECTION}.{name}")
         return default if value is None else value
 
-    cores = configured("cores", CORES)
+    cores = setting("cores", CORES)
     cluster = SLURMCluster(
         queue=address or None,
         cores=cores,
-        memory=configured("memory", MEMORY),
+        memory=setting("memory", MEMORY),
         processes=1,
         nanny=True,  # without it, a worker may hang when it closes
         # one task at a time on all cores of the job; Slurm limits the memory
-        worker_extra_args=[*configured("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
-        job_script_prologue=[*configured("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
+        worker_extra_args=[*setting("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
+        job_script_prologue=[*setting("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
         job_name="tacpipe",
         log_directory=str(folder),
         protocol="tls://",
@@ -138,7 +138,7 @@ def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, conf
     async def submit() -> None:
         await cluster
 
-    numbers: Sequence[str] = ()
+    job_ids: Sequence[str] = ()
     try:
         while len(cluster.worker_spec) < jobs:  # like `scale`, which discards the output of sbatch
             cluster.worker_spec.update(cluster.new_worker_spec())
@@ -146,13 +146,13 @@ def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, conf
             cluster.sync(submit)
         except RuntimeError as error:
             raise TacpipeError(f"Slurm refused a job: {_reason(str(error))}") from error
-        numbers = _numbers(cluster)
+        job_ids = _numbers(cluster)
         yield cluster
     finally:
-        if numbers:  # `close` waits for each worker, but an interrupted command must end within a second
-            subprocess.run(["scancel", *numbers], check=False, capture_output=True)
+        if job_ids:  # `close` waits for each worker, but an interrupted command must end within a second
+            subprocess.run(["scancel", *job_ids], check=False, capture_output=True)
         with contextlib.suppress(Exception):
-            cluster.close(timeout=None if numbers else 1.0)  # the default timeout without a worker is 10 s
+            cluster.close(timeout=None if job_ids else 1.0)  # the default timeout without a worker is 10 s
 
 
 def _numbers(cluster: SLURMCluster) -> list[str]:

@@ -127,7 +127,7 @@ def open_zarr(path: Path) -> ArrayContainer:
 def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None, rows: RowsOf) -> EpisodeContents:
     """Return the streams, attributes and skipped arrays of a recording. ``rows`` returns the rows of a stream.
 
-    Without ``sources``, streams without timestamps or a rate are skipped if other streams have them.
+    If ``sources`` is None, streams with neither timestamps nor a rate are skipped if another stream has either.
     """
     contents = episodes.group_into_parts(tree, episode)
     skipped = dict(contents.skipped)
@@ -146,9 +146,7 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
         else:
             parts_read.append(part)
     parts_and_times = [(part, episodes.time_of_part(tree, episode, part)) for part in parts_read]
-    selected = [
-        (part, time) for part, time in parts_and_times if (part.source in sources if sources is not None else True)
-    ]
+    selected = [(part, time) for part, time in parts_and_times if sources is None or part.source in sources]
     if sources is None and any(time.is_declared for _, time in selected):
         for part, time in selected:
             if not time.is_declared:

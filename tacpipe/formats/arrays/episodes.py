@@ -261,8 +261,8 @@ def _divide_by_length(
 ) -> Iterator[StreamArrays]:
     """Yield one stream per array length, and one per array of images or of structures.
 
-    A group's only stream has the group's name, others that of their first array. ``parent_clocks`` are the timestamps in
-    parent groups.
+    A group's only stream has the name of the group, other streams that of their first array. ``parent_clocks`` are the
+    arrays of timestamps in parent groups.
     """
     single_streams = [
         array

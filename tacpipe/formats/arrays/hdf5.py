@@ -230,9 +230,9 @@ def _expect_within_file(dataset: h5py.Dataset, available: int) -> None:
 
 
 def _member(group: h5py.Group, name: str, path: str, file: Path) -> ArrayDescription | str:
-    """Return an array, the path of a group, or "" for any other member.
+    """Return the description of an array, the path of a group, or "" for any other member of ``group``.
 
-    An array that is not read has the reason in ``problem``.
+    If an array cannot be read, ``problem`` of its description is the reason.
     """
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):

@@ -153,7 +153,8 @@ def open_bag(path: Path) -> Bag:
 def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, list[str]]:
     """Return the files of a bag in order, whether each message is compressed, and notes about the files.
 
-    ``stack`` keeps unpacked files. Raises `TacpipeError` if the bag has no files, or files of an unsupported storage.
+    Temporary files of compressed bags exist until ``stack`` is closed. Raises `TacpipeError` if the bag has no files, or
+    files of an unsupported storage.
     """
     if not path.is_dir():
         return [_unpack_file(path, stack)], False, []

@@ -42,7 +42,7 @@ def _add_metadata(content: Batched, metadata: dict[str, str], omitted_columns: t
 def _raw_images(content: Batched) -> Batched:
     """Return rows of raw images with their format as metadata and without padding.
 
-    Returns them unchanged if images differ in layout, or if their encoding cannot be decoded.
+    If the images differ in layout or their encoding cannot be decoded, the rows are returned unchanged.
     """
     present = [name for name in LAYOUT if name in content.schema.names]
     if not {"height", "width", "encoding", "step"} <= set(present):
@@ -63,16 +63,16 @@ def _raw_images(content: Batched) -> Batched:
     row_bytes = width * RAW_FORMATS[layout["encoding"]][1]
     if step < row_bytes or sizes != {step * height}:
         return content
-    declared = _add_metadata(content, video_format.to_metadata(), tuple(present))
+    with_format = _add_metadata(content, video_format.to_metadata(), tuple(present))
     if step == row_bytes:
-        return declared
+        return with_format
 
     def remove_padding(table: pa.Table) -> pa.Table:
         images = [
             b"".join(image[start : start + row_bytes] for start in range(0, step * height, step))
             for image in table.column(PICTURE).to_pylist()
         ]
-        at = table.schema.get_field_index(PICTURE)
-        return table.set_column(at, table.schema.field(at), pa.array(images, pa.binary()))
+        index = table.schema.get_field_index(PICTURE)
+        return table.set_column(index, table.schema.field(index), pa.array(images, pa.binary()))
 
-    return declared.mapped(declared.schema, remove_padding)
+    return with_format.mapped(with_format.schema, remove_padding)

@@ -130,7 +130,7 @@ def single_part(shape: MessageShape) -> list[MessagePart]:
 
 
 def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> MessagePart:
-    """Return a part with these leaves. Column names omit the first ``start`` names of each path.
+    """Return a message part with a column per leaf. Column names omit the first ``start`` names of each path.
 
     A name that would occur several times is preceded by the path of its parent.
     """
@@ -148,8 +148,8 @@ def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -
             result.columns.append(PartColumn("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
         elif meaning := enclosing_meaning(leaf):
             name, quantity, unit, component, depth = meaning
-            before = _join_path(leaf.path[start:depth]) + "_" if counts[name] > 1 and depth > start else ""
-            result.columns.append(PartColumn(before + name, leaf, about=_metadata(quantity, unit, component=component)))
+            prefix = _join_path(leaf.path[start:depth]) + "_" if counts[name] > 1 and depth > start else ""
+            result.columns.append(PartColumn(prefix + name, leaf, about=_metadata(quantity, unit, component=component)))
         else:
             result.columns += columns_from_leaf(leaf, _join_path(path) or "data")
     return result

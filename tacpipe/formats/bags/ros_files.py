@@ -164,7 +164,7 @@ def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
 
 
 def _read_channels(connection: sqlite3.Connection) -> Iterator[Record]:
-    """Yield the channels in a database with the definitions of their types, and the ROS distribution."""
+    """Yield a record per topic of a database, with the definition of its type, then one with the ROS distribution."""
     definitions: dict[str, tuple[str, bytes]] = {}
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "message_definitions" in tables:

@@ -250,7 +250,7 @@ Leaf = str | bytes | float | bool | None  # a value of a message
 
 
 def block_from_rows(rows: Sequence[Mapping[str, Leaf]], types: Mapping[str, pa.DataType]) -> Block:
-    """Return messages, given as values by path, as columns. ``types`` are the types of paths declared by a schema.
+    """Return a block of columns from messages, each a mapping from path to value. ``types`` are types declared by a schema.
 
     Raises `TopicError` if there are too many paths.
     """

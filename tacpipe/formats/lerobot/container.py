@@ -166,7 +166,7 @@ class LeRobotContainer:
     ) -> list[SourceStream]:
         """Return the streams of an episode: one per feature or group of features, and one per video.
 
-        Without ``rows``, their tables are empty.
+        The tables are empty if ``rows`` is False.
         """
         by_source: dict[str, list[FeatureDescription]] = {}
         for feature in self._about.features.values():
@@ -205,10 +205,10 @@ class LeRobotContainer:
     def _video_stream(
         self, episode: EpisodeDescription, key: str, name: str, t_ns: Int64s, clock: pa.Field
     ) -> SourceStream:
-        """Return the frames of an episode from its video, with the timestamps ``t_ns`` (frame,) of its rows.
+        """Return a stream of an episode's frames in the video ``key``, with the timestamps ``t_ns`` (frame,).
 
         Raises `TacpipeError` if the video is unreadable, shorter than the episode, or cannot be cut at the episode's
-        ends.
+        start and end.
         """
         path = regular.inside(self.path, episode.videos[key])
         frames = _scan_video(path, path.stat().st_mtime_ns)

@@ -176,7 +176,8 @@ class NumpyArchive:
         """Raise `TacpipeError` if arrays of one stream have different numbers of rows."""
         lengths = {name: array.rows for name, array in arrays.items()}
         if len(set(lengths.values())) > 1:
-            first, second = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
+            first = next(iter(lengths))
+            second = next(name for name in lengths if lengths[name] != lengths[first])
             raise TacpipeError(
                 f"{self.path}: {plain(first)} has {lengths[first]} rows and {plain(second)} has {lengths[second]}; arrays "
                 f"of one stream have one length. Skip those of another rate, and read them as a stream of their own."

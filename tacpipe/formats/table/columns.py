@@ -121,7 +121,7 @@ def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: Strea
 
 
 def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
-    """Return the field of a cell by its index in the array of a rule's shape.
+    """Return the field of a cell, ``cell`` being its flat index in an array of the shape that the column's rule declares.
 
     A tactile cell has a taxel and an axis, another cell an index and a component; taxel and index count from 1.
     """
@@ -136,12 +136,16 @@ def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
     number = int(np.ravel_multi_index(index, sides)) + 1 if sides else 1
     count = math.prod(sides)
     is_tactile = rule.quantity in ("", "tactile")
-    metadata = {"taxel" if is_tactile else "index": str(number)} if is_tactile or count > 1 else {}
-    metadata |= {"axis" if is_tactile else "component": axis} if axis else {}
+    metadata: dict[str, str] = {}
+    plain_name = "taxel" if is_tactile else column.name.rstrip("0123456789").rstrip("_")
     padded = str(number).zfill(max(2, len(str(count))))
+    if is_tactile or count > 1:
+        metadata["taxel" if is_tactile else "index"] = str(number)
+        plain_name += padded
+    if axis:
+        metadata["axis" if is_tactile else "component"] = axis
+        plain_name += f"_{axis}"
     values = pattern.match(rule.match, column.name) or {}
-    stem = "taxel" if is_tactile else column.name.rstrip("0123456789").rstrip("_")
-    plain_name = f"{stem}{padded if is_tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
     name = pattern.fill_pattern(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
     declared_metadata = field_metadata(column.field)
     retained = {key: value for key, value in declared_metadata.items() if key not in values}

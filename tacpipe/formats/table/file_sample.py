@@ -85,14 +85,15 @@ def first_lines(path: Path, encoding: str = "utf-8") -> list[str]:
 def detect_dialect(lines: Sequence[str]) -> Dialect:
     """Return the dialect of the first lines of a file.
 
-    >>> found = detect_dialect(["# made by x", "t;fx", "0,1;3,5", "0,2;4"])
-    >>> found.separator, found.decimal, found.comment, found.header, found.names
+    >>> dialect = detect_dialect(["# made by x", "t;fx", "0,1;3,5", "0,2;4"])
+    >>> dialect.separator, dialect.decimal, dialect.comment, dialect.header, dialect.names
     (';', ',', '#', True, ('t', 'fx'))
     >>> detect_dialect(["1.5,2", "2.5,3"]).names
     ('column1', 'column2')
     """
     line_texts = [line.rstrip("\r\n").removeprefix("\ufeff") for line in lines]
-    comment = next((mark for mark in COMMENTS if any(text.lstrip().startswith(mark) for text in line_texts)), "")
+    used_marks = [mark for mark in COMMENTS if any(text.lstrip().startswith(mark) for text in line_texts)]
+    comment = used_marks[0] if used_marks else ""
     data_lines = [text for text in line_texts if text.strip() and not (comment and text.lstrip().startswith(comment))]
     separator, width = _guess_separator(data_lines)
     cells = [tuple(cell.strip() for cell in next(csv.reader([text], delimiter=separator))) for text in data_lines]

@@ -53,18 +53,18 @@ class _FileGroup:
 
 
 def guess_layout(folder: Path) -> str:
-    """Return the text of a layout for the files below ``folder``. Raises `UsageError` if none of them can be a stream."""
+    """Return the text of a guessed layout for the files below ``folder``. Raises `UsageError` if no file can be a stream."""
     all_paths = [
         Path(directory, name).relative_to(folder) for directory, _, names in file_system.walk(folder) for name in names
     ]
-    data = [path for path in all_paths if extension(path) in EXTENSIONS]
-    videos = [path for path in all_paths if extension(path) in DEMUXERS]
-    images = [path for path in all_paths if extension(path) in IMAGE_CODECS and path.parent.parts]
-    if not (data or videos or images):
+    table_paths = [path for path in all_paths if extension(path) in EXTENSIONS]
+    video_paths = [path for path in all_paths if extension(path) in DEMUXERS]
+    image_paths = [path for path in all_paths if extension(path) in IMAGE_CODECS and path.parent.parts]
+    if not (table_paths or video_paths or image_paths):
         kinds = ", ".join((*EXTENSIONS, *CAMERA_EXTENSIONS))
         raise UsageError(f"{folder} holds no file of {kinds}; there is nothing to guess from.")
-    groups, labels, damaged = _group_files(folder, data)
-    groups += _camera_groups(folder, videos, images, {group.stream for group in groups}, damaged)
+    groups, labels, damaged = _group_files(folder, table_paths)
+    groups += _camera_groups(folder, video_paths, image_paths, {group.stream for group in groups}, damaged)
     groups, stamps = _match_stamp_files(groups)
     if not groups:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
@@ -77,17 +77,17 @@ def guess_layout(folder: Path) -> str:
             path, "it is no stream, and no file of labels that each recording has"
         )
 
-    parts = [_stream_text(group) for group in groups]
-    parts += [_labels_text(group) for group in labels]
-    parts += [f"[[labels]]\nfile = {quoted(text)}" for text in trees]
-    parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
+    sections = [_stream_text(group) for group in groups]
+    sections += [_labels_text(group) for group in labels]
+    sections += [f"[[labels]]\nfile = {quoted(text)}" for text in trees]
+    sections.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
     header = [
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
         *(f"# {shown(line)}" for line in container.describe_unread(folder, read_files, explain)),
     ]
-    return "\n\n".join(["\n".join(header), *parts]) + "\n"
+    return "\n\n".join(["\n".join(header), *sections]) + "\n"
 
 
 def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], list[_FileGroup], dict[str, str]]:

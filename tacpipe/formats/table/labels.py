@@ -88,17 +88,18 @@ def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attri
 
 
 def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
-    """Return other names of a recording in a table: the folders and files that contain its placeholders.
+    """Return other names that a table may use for a recording: those of folders and files that contain its placeholders.
 
     With the pattern ``run_{trial}/skin.csv``, the recording of ``run_07/skin.csv``, whose trial is 07, is also called
     run_07.
     """
     segments = {segment for stream in layout.streams for segment in stream.files.split("/")}
-    return sorted(
-        pattern.fill_pattern(part, source.values).partition(".")[0]
-        for part in segments
-        if (names := pattern.placeholders(part)) and "*" not in part and set(names) <= set(source.values)
-    )
+    alternatives = []
+    for segment in segments:
+        names = pattern.placeholders(segment)
+        if names and "*" not in segment and set(names) <= set(source.values):
+            alternatives.append(pattern.fill_pattern(segment, source.values).partition(".")[0])
+    return sorted(alternatives)
 
 
 def _find_row(

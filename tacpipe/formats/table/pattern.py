@@ -139,15 +139,15 @@ def _tokens(name: str) -> list[_Token]:
 def _level_pattern(
     names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool
 ) -> str:
-    """Return the pattern of one level of paths, whose ``names`` are given as tokens.
+    """Return the pattern of one level of paths from the ``names`` at this level, which are split into tokens.
 
-    Adds its placeholders with their texts to ``in_use``; a placeholder with the same texts is used again. ``is_last``:
-    the last text that differs is the trial.
+    Each part that differs becomes a placeholder. ``in_use`` maps placeholders to their texts; those of this level are added,
+    and a placeholder with the same texts is used again. If ``is_last``, the last part that differs is the trial.
     """
-    parts = _common_parts(names)
-    differing = [index for index, (_, texts) in enumerate(parts) if len(set(texts)) > 1]
+    common_parts = _common_parts(names)
+    differing = [index for index, (_, texts) in enumerate(common_parts) if len(set(texts)) > 1]
     pattern = ""
-    for index, (kind, texts) in enumerate(parts):
+    for index, (kind, texts) in enumerate(common_parts):
         counter = _COUNTER.search(pattern)
         word = re.search(r"([A-Za-z]{2,})[-_ #.]*$", pattern)
         if kind not in ("date", "number", "text"):
@@ -164,20 +164,23 @@ def _level_pattern(
             name = TRIAL
         else:
             name = word[1].lower() if kind == "number" and word else f"folder{level + 1}"
-        same = [
+        matching = [
             placeholder
             for placeholder, texts_in_use in in_use.items()
             if texts_in_use == texts and (placeholder == name or len(set(texts)) > 1)
         ]
         candidates = (f"{name}{number}" if number > 1 else name for number in itertools.count(1))
-        name = same[0] if same else next(candidate for candidate in candidates if candidate not in in_use)
+        name = matching[0] if matching else next(candidate for candidate in candidates if candidate not in in_use)
         in_use[name] = texts
         pattern += f"{{{name}}}"
     return pattern
 
 
 def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the parts that all names have, each with its text per name; everything that differs is one part, ``text``."""
+    """Return the parts that all names have in common, as kind and text in each name.
+
+    Between the common start and the common end, everything else is a single part of the kind ``text``.
+    """
     kinds = [[kind for kind, _ in tokens] for tokens in names]
     start_count = _count_common_start(kinds)
     end_count = 0

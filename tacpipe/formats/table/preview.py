@@ -212,7 +212,7 @@ def _describe_labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[st
 
 
 def _describe_stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Path) -> list[str]:
-    """Return a line about a stream, one per group of columns with the same meaning, and the first rows."""
+    """Return lines that describe a stream: a summary, one line per group of similar columns, and the first rows."""
     summary = summarize_stream(rows)
     start = np.datetime64(summary.first_ns, "ns")
     lines = [

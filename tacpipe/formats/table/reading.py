@@ -184,8 +184,9 @@ def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = 
 def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 
-    Where the layout's ``stream`` sets no time or no columns, those of the container apply. Metadata of the time
-    column are copied to ``t_ns``. A column of images becomes packets. Raises the errors of `stream_batches`.
+    If the layout's ``stream`` sets no time, the container's time applies; if it sets no columns, the container's columns
+    do. Metadata of the time column are copied to ``t_ns``. A column of images becomes packets. Raises the errors of
+    `stream_batches`.
     """
     timed_stream = stream if stream.time.is_declared else replace(stream, time=source.time)
     if not timed_stream.time.is_declared:
@@ -197,15 +198,15 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
     for field in source.schema:
         if field.type not in columns.TYPES.values():
             raise TacpipeError(f"{path}: column {plain(field.name)} of {plain(source.source)} holds {field.type}.")
-    clock = timed_stream.time.column
-    clock_field = declared.get(clock)
-    is_other_clock = clock_field is not None and clock != source.time.column
-    is_number = clock_field is not None and (
-        pa.types.is_integer(clock_field.type) or pa.types.is_floating(clock_field.type)
-    )
-    file = ContainedRows(path, source, clock if is_other_clock and is_number else "")
-    metadata = schema.field_metadata(clock_field) if clock_field else {}
-    time_metadata = {key: value for key, value in metadata.items() if key not in ("unit", "quantity")}
+    clock = declared.get(timed_stream.time.column)
+    sort_column, time_metadata = "", dict[str, str]()
+    if clock is not None:
+        is_number = pa.types.is_integer(clock.type) or pa.types.is_floating(clock.type)
+        if is_number and clock.name != source.time.column:  # the rows are in the order of the container's time
+            sort_column = clock.name
+        metadata = schema.field_metadata(clock)
+        time_metadata = {key: value for key, value in metadata.items() if key not in ("unit", "quantity")}
+    file = ContainedRows(path, source, sort_column)
     reader = _batches(file, timed_stream, None, declared, time_metadata)
     table_or_reader = reader.read_all() if isinstance(source.content, pa.Table) else reader
     return frames_from_images(table_or_reader, f"{path}, {plain(source.source)}", timed_stream.time.rate_hz)

@@ -184,19 +184,19 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
     shared_streams = [
         stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
     ]
-    names_by_stream = {
-        stream.name: names_in_file
-        for stream in shared_streams
-        if (names_in_file := _names_in_file(files[stream.name], stream)) is not None
-    }
+    names_by_stream = {}
+    for stream in shared_streams:
+        names = _names_in_file(files[stream.name], stream)
+        if names is not None:
+            names_by_stream[stream.name] = names
     if not names_by_stream:
         return [RecordingFiles(_recording_name(layout, values, files), files, values)]
     first = next(iter(names_by_stream.values()))
-    for stream, names in names_by_stream.items():
+    for stream_name, names in names_by_stream.items():
         if names != first:
             odd_names = sorted(names ^ first)
             raise UsageError(
-                f"{files[stream]} and {files[next(iter(names_by_stream))]} hold different recordings: "
+                f"{files[stream_name]} and {files[next(iter(names_by_stream))]} hold different recordings: "
                 f"{listed(odd_names, 3)} is "
                 f"in only one of them."
             )

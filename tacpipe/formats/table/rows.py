@@ -136,11 +136,11 @@ class RowFile(Protocol):
 
 @dataclass(frozen=True)
 class ContainedRows:
-    """The rows of a container's stream; ``clock`` is an integer column by which they are sorted."""
+    """The rows of a container's stream, sorted by the column ``sort_column`` unless it is empty."""
 
     path: Path
     stream: SourceStream
-    clock: str = ""
+    sort_column: str = ""
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
@@ -149,12 +149,12 @@ class ContainedRows:
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the rows of the columns in ``types``."""
         blocks = (block.select(list(types)) for block in self.stream.blocks())
-        if not self.clock:
+        if not self.sort_column:
             yield from blocks
             return
         spill = Spill()
-        pieces = [piece for block in blocks for piece in spill.add_run(block, self.clock)]
-        yield from in_order(pieces, spill.read, self.clock)
+        pieces = [piece for block in blocks for piece in spill.add_run(block, self.sort_column)]
+        yield from in_order(pieces, spill.read, self.sort_column)
 
     def place(self, index: int) -> str:
         """Return the name of the row ``index`` (from 0) in errors."""

@@ -89,34 +89,34 @@ def parse_stamps(column: pa.Array, time_format: str) -> tuple[Int64s, Bools]:
     import numpy as np
     import pyarrow.compute as pc
 
-    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(time_format))
+    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(time_format))  # by directive letter
     valid = groups.is_valid().to_numpy(zero_copy_only=False)
-    parts = {field.name: pc.struct_field(groups, field.name).fill_null("") for field in groups.type}
+    texts = {field.name: pc.struct_field(groups, field.name).fill_null("") for field in groups.type}
 
-    def number(letter: str, default: int = 0) -> Int64s:
-        values = parts.get(letter)
+    def number_of(letter: str, default: int = 0) -> Int64s:
+        values = texts.get(letter)
         if values is None:
             return np.full(len(column), default, np.int64)
         filled = pc.if_else(pc.equal(values, ""), str(default), values)
         return np.asarray(filled.cast("int64").to_numpy(zero_copy_only=False))
 
-    month = number("m", 1)
-    for letter in {"b", "B"} & set(parts):
-        names = pc.utf8_slice_codeunits(pc.utf8_lower(parts[letter]), 0, 3).to_pylist()
+    month = number_of("m", 1)
+    for letter in {"b", "B"} & set(texts):
+        names = pc.utf8_slice_codeunits(pc.utf8_lower(texts[letter]), 0, 3).to_pylist()
         month = np.array([_MONTHS.index(name) + 1 if name in _MONTHS else 0 for name in names], np.int64)
-    year = number("Y", 1970) if "y" not in parts else number("y") + np.where(number("y") < 69, 2000, 1900)
-    hour = number("H")
-    if "I" in parts:
-        afternoon = np.array([text[:1].lower() == "p" for text in parts["p"].to_pylist()]) if "p" in parts else False
-        hour = number("I") % 12 + np.where(afternoon, 12, 0)
-    day, minute, second = number("d", 1), number("M"), number("S")
+    year = number_of("Y", 1970) if "y" not in texts else number_of("y") + np.where(number_of("y") < 69, 2000, 1900)
+    hour = number_of("H")
+    if "I" in texts:
+        afternoon = np.array([text[:1].lower() == "p" for text in texts["p"].to_pylist()]) if "p" in texts else False
+        hour = number_of("I") % 12 + np.where(afternoon, 12, 0)
+    day, minute, second = number_of("d", 1), number_of("M"), number_of("S")
     valid &= (month >= 1) & (month <= 12) & (year >= 1678) & (year < 2262) & (hour < 24) & (minute < 60) & (second < 61)
     months = (np.where(valid, year, 1970) - 1970) * 12 + np.where(valid, month, 1) - 1
     days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
     valid &= (day >= 1) & (days.astype("datetime64[D]").astype("datetime64[M]").astype(np.int64) == months)
     fraction = np.zeros(len(column), np.int64)
-    if "f" in parts:
-        padded = pc.utf8_rpad(parts["f"], 9, "0")
+    if "f" in texts:
+        padded = pc.utf8_rpad(texts["f"], 9, "0")
         fraction = np.asarray(padded.cast("int64").to_numpy(zero_copy_only=False))
     t_ns = ((days * 24 + hour) * 60 + minute) * 60 + second
     return np.where(valid, t_ns * 10**9 + fraction, 0), valid

@@ -356,7 +356,7 @@ class Workbook:
     def _column(
         self, name: str, kind: pa.DataType, block: list[tuple[int, tuple[Any, ...]]], column_index: int
     ) -> pa.Array:
-        """Return the cells of a column as ``kind``, or as floats or booleans; timestamps have the type of the sheet.
+        """Return the cells of a column: strings and booleans as ``kind``, numbers as floats, timestamps as in the sheet.
 
         Raises `TacpipeError` for the first cell of another type.
         """

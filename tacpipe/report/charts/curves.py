@@ -194,11 +194,10 @@ def _scales(
     if log:
         y_scale["type"] = "log"
     if floor is not None:
-        plotted_values = [
-            value for row in values for key in ("y", "low", "high") if isinstance(value := row.get(key), float)
-        ]
+        cells = [row.get(key) for row in values for key in ("y", "low", "high")]
+        plotted_values = [cell for cell in cells if isinstance(cell, float)]
         y_scale["domain"] = [max(floor, min([0.0, *plotted_values])), max([0.05, *plotted_values])]
-    if diagonal:  # points at its ends are not clipped
+    if diagonal:  # the margin prevents that points at its ends are clipped
         margin = ROOM * (diagonal[1] - diagonal[0])
         y_scale["nice"] = False
         y_scale["domain"] = x_scale["domain"] = [short(diagonal[0] - margin), short(diagonal[1] + margin)]

@@ -331,23 +331,18 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
 
 
 def grid(matrix: AnyFloats, title: str) -> Spec:
-    """Return a square matrix as squares: the colour is stronger farther from 0, blue above and orange below.
+    """Return a chart of a square matrix: a coloured square per value, blue above 0 and orange below, stronger far from 0.
 
-    Squares near 0 are omitted; ``title`` is that of both axes.
+    Squares near 0 are omitted; both axes have the same ``title``.
     """
     largest = float(np.abs(matrix).max()) or 1.0
-    values: list[DataRow] = [
-        {
-            "row": row + 1,
-            "column": column + 1,
-            "value": short(float(value)),
-            "above": bool(value > 0),
-            "strength": strength,
-        }
-        for (row, column), value in np.ndenumerate(matrix)
+    values: list[DataRow] = []
+    for (row, column), value in np.ndenumerate(matrix):
         # the square root makes small values visible next to the largest
-        if (strength := round(math.sqrt(abs(float(value)) / largest), 2)) >= 0.01
-    ]
+        strength = round(math.sqrt(abs(float(value)) / largest), 2)
+        if strength >= 0.01:
+            square: DataRow = {"row": row + 1, "column": column + 1, "value": short(float(value))}
+            values.append(square | {"above": bool(value > 0), "strength": strength})
     axis: ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
     return {
         "data": {"values": values},

@@ -32,6 +32,7 @@ def is_undetectable(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: b
 
 
 def _frame_bytes(sensor: Sensor, pieces: Sequence[bytes]) -> list[bytes]:
+    """Return the complete frames in consecutive ``pieces`` of a sensor's bytes."""
     framer = sensor.framer()
     chunks = [chunk for piece in pieces for chunk in _chunks(sensor, piece)]
     runs, _ = framer.feed(Chunks.from_pairs(list(enumerate(chunks))))

@@ -104,7 +104,7 @@ class Slcan(Pty):
         super().__init__(sensor, link)
         self.address = Address("can", f"slcan:{link}")
 
-    def wrong_baud(self) -> bool:
+    def has_wrong_baud(self) -> bool:
         """Return False: the baud rate of a USB adapter does not matter."""
         return False
 

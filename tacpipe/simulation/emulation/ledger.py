@@ -38,7 +38,7 @@ def decode_frames(sensor: Sensor, frames: Frames) -> Samples:
 
 
 def concatenate(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Samples:
-    """Concatenate samples. ``frames`` are the numbers of frames of the parts, by default those in their ``rows``."""
+    """Concatenate samples. ``frames`` is the number of frames of each part, by default the highest one in its ``rows``."""
     counts = frames or [int(part.rows.max(initial=-1)) + 1 for part in parts if part.rows is not None]
     values = tuple(np.concatenate(blocks) for blocks in zip(*(part.values for part in parts), strict=True))
     starts = np.cumsum([0, *counts])

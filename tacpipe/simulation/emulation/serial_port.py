@@ -23,24 +23,24 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.endpoint import sent_sizes
 
-IDLE_BITS = 30  # after the last byte
+IDLE_BITS = 30  # length of the idle line after the last byte
 
 
-def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+def garble(data: bytes, sent_baud: int, read_baud: int) -> bytes:
     """Return the bytes read at ``read_baud`` if ``data`` is sent at ``sent_baud`` (8 bits, no parity, one stop bit).
 
     A byte starts at a falling edge. Bytes without a stop bit are retained, as by default in Linux.
 
-    >>> garbled(b"touch", 9600, 9600)
+    >>> garble(b"touch", 9600, 9600)
     b'touch'
-    >>> garbled(b"UUUU", 9600, 19200) == b"UUUU"
+    >>> garble(b"UUUU", 9600, 19200) == b"UUUU"
     False
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")  # (byte, bit)
     framed = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)])
-    line = np.append(framed.ravel(), np.ones(IDLE_BITS + round(12 * sent_baud / read_baud), np.uint8))
     width = sent_baud / read_baud  # length of a received bit in sent bits
-    middles = (1.5 + np.arange(8)) * width
+    line = np.append(framed.ravel(), np.ones(IDLE_BITS + round(12 * width), np.uint8))
+    middles = (1.5 + np.arange(8)) * width  # of the data bits, after the start bit
     low = np.flatnonzero(line == 0)
     received, position = [], 0.0
     while (row := int(np.searchsorted(low, np.floor(position)))) < len(low):
@@ -67,8 +67,8 @@ class HostPort:
 
     @property
     def fault(self) -> str:
-        """The cause `byte_faults.BAUD` if the host had set another baud rate at the last write."""
-        return byte_faults.BAUD if self.endpoint.garbling else byte_faults.SOUND
+        """`byte_faults.BAUD` if the host had set a wrong baud rate at the last write, else `byte_faults.SOUND`."""
+        return byte_faults.BAUD if self.endpoint.is_garbled else byte_faults.SOUND
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Write pieces, and return the number of written bytes of each."""
@@ -85,7 +85,7 @@ class Pty:
         self.peers: list[HostPort] = []
         self._master = -1
         self._baud = 0  # speed that the host has set
-        self.garbling = False
+        self.is_garbled = False  # whether the last write was at a wrong baud rate
         self.replug()
 
     def replug(self) -> None:
@@ -123,7 +123,7 @@ class Pty:
         return [self._master] if self.peers else []
 
     def ready(self, descriptor: int) -> list[tuple[HostPort, bytes]]:
-        """Return the host with the bytes from it, garbled at a wrong baud rate; nothing if there are none."""
+        """Return the host with each message from it, garbled at a wrong baud rate; an empty list if there is none."""
         try:
             data = os.read(self._master, MAX_READ_BYTES)
         except BlockingIOError:
@@ -131,12 +131,12 @@ class Pty:
         except OSError:  # EIO: the host closed its port
             self.peers = []
             return []
-        if self.wrong_baud():
-            data = garbled(data, self._baud, self.sensor.baud)
-        return [(self._port, heard) for heard in self.from_wire(data)]
+        if self.has_wrong_baud():
+            data = garble(data, self._baud, self.sensor.baud)
+        return [(self._port, message) for message in self.from_wire(data)]
 
     def look(self) -> list[tuple[HostPort, bytes]]:
-        """Return the host with an empty message if it has just opened the port, else nothing."""
+        """Return the host with an empty message if it has just opened the port, else an empty list."""
         if self._master < 0 or self.peers:
             return []
         poll = select.poll()
@@ -146,17 +146,17 @@ class Pty:
         self.peers = [self._port]
         return [(self._port, b"")]
 
-    def wrong_baud(self) -> bool:
-        """Return whether the host has set another baud rate than the device's."""
+    def has_wrong_baud(self) -> bool:
+        """Return whether the host has set a baud rate that differs from the device's."""
         self._baud = _host_baud(self._master) if self._master >= 0 else 0
         return bool(self._baud) and self._baud != getattr(self.sensor, "baud", self._baud)
 
     def write(self, pieces: Sequence[bytes]) -> list[int]:
         """Write pieces, garbled at a wrong baud rate, and return the number of written bytes of each."""
         wire_bytes = [self.to_wire(piece) for piece in pieces]
-        self.garbling = self.wrong_baud()
-        if self.garbling:
-            wire_bytes = [garbled(piece, self.sensor.baud, self._baud) for piece in wire_bytes]
+        self.is_garbled = self.has_wrong_baud()
+        if self.is_garbled:
+            wire_bytes = [garble(piece, self.sensor.baud, self._baud) for piece in wire_bytes]
         count = 0
         with contextlib.suppress(BlockingIOError):
             count = os.write(self._master, b"".join(wire_bytes))

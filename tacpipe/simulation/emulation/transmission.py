@@ -171,39 +171,44 @@ class Transmission:
         return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
 
     def _send(self, items: Sequence[SentItem], now_ns: int) -> None:
-        """Send items to all hosts, and add to the ledger what the first host accepted.
-
-        A patient stream queues them for its first streaming host instead. A host that does not stream gets the frames that
-        it requested.
-        """
+        """Send items to all hosts. A patient stream queues them for its first streaming host instead."""
         if not items:
             return
         self._latest = next((item for item in reversed(items) if item.data and item.number >= 0), self._latest)
-        streaming = next((peer for peer in self._receivers() if peer.device.streaming), None)
+        receivers = self._receivers()
+        streaming = next((peer for peer in receivers if peer.device.streaming), None)
         if self._patient and streaming is not None:
-            if streaming is not self._unsent_peer:
-                self._unsent.clear()
-            self._unsent_peer = streaming
-            self._unsent.extend((item, item.data) for item in items)
-            self._flush_unsent(now_ns)
-            return
-        sizes: list[int] | None = None
-        fault = byte_faults.SOUND
-        pieces = [item.data for item in items]
-        for peer in self._receivers():
-            part = pieces if peer.device.streaming else pieces[: peer.pending_frames]
-            sent = self._post(peer, part)
-            peer.pending_frames = max(0, peer.pending_frames - len(part)) if not peer.device.streaming else 0
-            if sizes is None:
-                sizes, fault = sent, peer.fault
-        if sizes is not None:
-            self._add_to_ledger(items[: len(sizes)], sizes, fault, now_ns)
+            self._queue_unsent(items, streaming, now_ns)
+        else:
+            self._send_to_all(items, receivers, now_ns)
 
-    def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
+    def _send_to_all(self, items: Sequence[SentItem], receivers: Sequence[Peer], now_ns: int) -> None:
+        """Send items to all ``receivers``, and add to the ledger what the first receiver accepted.
+
+        A host that does not stream gets only the frames that it requested.
+        """
+        frames = [item.data for item in items]
+        for peer in receivers:
+            allowed = frames if peer.device.streaming else frames[: peer.pending_frames]
+            sizes = self._post(peer, allowed)
+            peer.pending_frames = 0 if peer.device.streaming else peer.pending_frames - len(allowed)
+            if peer is receivers[0]:
+                self._add_to_ledger(items[: len(sizes)], sizes, peer.fault, now_ns)
+
+    def _queue_unsent(self, items: Sequence[SentItem], peer: Peer, now_ns: int) -> None:
+        """Queue items for ``peer``, and send what it accepts. Items queued for another host are dropped."""
+        if peer is not self._unsent_peer:
+            self._unsent.clear()
+        self._unsent_peer = peer
+        self._unsent.extend((item, item.data) for item in items)
+        self._flush_unsent(now_ns)
+
+    def _post(self, peer: Peer, frames: Sequence[bytes]) -> list[int]:
+        """Send frames, some of which may be empty, and return how many bytes of each the host accepted."""
         post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
-        full = [piece for piece in pieces if piece]
-        sent = iter(post(full) if full else [])
-        return [next(sent) if piece else 0 for piece in pieces]
+        non_empty = [frame for frame in frames if frame]
+        sizes = iter(post(non_empty) if non_empty else [])
+        return [next(sizes) if frame else 0 for frame in frames]
 
     def _flush_unsent(self, now_ns: int) -> None:
         """Send unsent items in order while the host accepts them. They are dropped if their host has disconnected."""
@@ -222,7 +227,7 @@ class Transmission:
         self._retry_ns = now_ns + RETRY_NS
 
     def _add_to_ledger(self, items: Iterable[SentItem], sizes: Sequence[int], fault: str, now_ns: int) -> None:
-        """Add items with their sent ``sizes``, and as their cause what their host did if it did not take all bytes."""
+        """Add items with their sent ``sizes`` in bytes. If the host lost or garbled bytes, that is the cause of the item."""
         for item, size in zip(items, sizes, strict=True):
             cause = item.cause
             if size < len(item.data):
@@ -232,7 +237,7 @@ class Transmission:
             self.ledger.add(item, self._epoch_ns + item.due_ns, now_ns, size, cause)
 
     def receive(self, peer: Peer, data: bytes, now_ns: int) -> None:
-        """Pass bytes from a host to the device, and send its replies, followed by requested frames."""
+        """Pass bytes from a host to the device, and send its replies, then the frames that the host requested."""
         if not data:
             self.ledger.add_event(now_ns, "connected")
         elif len(self.ledger.events) < MAX_MESSAGES:

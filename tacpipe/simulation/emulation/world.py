@@ -151,7 +151,7 @@ class World:
     def _generate(self, number: int) -> Cycle:
         """Return the cycle with this number: a trial and the return to its start."""
         scene = replace(pick_and_move.perform(self._seed, number, self._rig), skins=self.skins)
-        full_scene = with_return(scene)
+        full_scene = append_return(scene)
         return Cycle(
             full_scene, joint_course(full_scene.path.t_ns, full_scene.path.position_m, full_scene.path.yaw_rad)
         )
@@ -193,8 +193,8 @@ class World:
         return self.at(t_ns, lambda cycle, local_ns: cycle.torques(local_ns))
 
 
-def with_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
-    """Return a scene with the return appended. Its last row equals its first."""
+def append_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
+    """Return a scene with a release and the hand's way back appended, so that its last row equals its first."""
     rows = round(RETURN_S * trajectory.RATE_HZ)
     elapsed_s = np.arange(1, rows + 1) / trajectory.RATE_HZ
     grip = 1 - trajectory.minimum_jerk(np.clip(elapsed_s / RELEASE_S, 0.0, 1.0))  # (time,), fraction of the grip

@@ -327,10 +327,10 @@ class Forecaster:
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32.
 
-        Raises `TacpipeError` if a shape is not what the model reads, or a value is not finite or not an orientation.
+        Raises `TacpipeError` if the model cannot read a shape, a value is not finite, or a quaternion is zero.
         """
         channels, posed, derived = len(self.codec.channels), len(self.pose.columns), len(self.derived_columns)
-        for name, array, rows, before, widths in (
+        for name, array, rows, first_column, widths in (
             ("window", window, self.context, channels, (channels + posed + derived + 1, channels + posed)),
             ("plan", plan, self.horizon, 0, (posed + derived, posed)),
         ):
@@ -345,7 +345,7 @@ class Forecaster:
                     f"The {name} holds {array[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
                     "all values must be finite. Leave the window out, or repair the recording."
                 )
-            if self.pose.orientation and not array[..., before + 3 : before + POSE].any(axis=-1).all():
+            if self.pose.orientation and not array[..., first_column + 3 : first_column + POSE].any(axis=-1).all():
                 raise TacpipeError(f"The {name} holds a quaternion of length 0, which is not an orientation.")
         if len(window) != len(plan):
             raise TacpipeError(

@@ -288,8 +288,8 @@ def headline(
 
 
 def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS) -> Measure:
-    """Return the measure that turns `sums` at some steps into errors; ``unit`` is the unit of the mean absolute errors."""
-    ahead = [f"t+{step}" for step in steps]
+    """Return the measure that computes errors from `sums` at ``steps``; ``unit`` is that of the mean absolute errors."""
+    step_names = [f"t+{step}" for step in steps]
 
     def error(sums: AnyFloats) -> AnyFloats:
         return 1 - Parts.from_sums(sums).mean_skill
@@ -300,11 +300,11 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         return (*map(float, mae), float(parts.squared_skill), float(parts.mean_skill))
 
     # The ranking score has its own column, because errors by step do not rank predictors.
-    over = " and ".join(filter(None, (", ".join(ahead[:-1]), ahead[-1])))
+    all_steps = " and ".join(filter(None, (", ".join(step_names[:-1]), step_names[-1])))
     return Measure(
-        (*(f"MAE {step}" for step in ahead), "squared vs persistence", "vs persistence"),
+        (*(f"MAE {step}" for step in step_names), "squared vs persistence", "vs persistence"),
         unit,
-        f"the mean absolute error as a fraction of persistence's, the geometric mean over recordings and over {over} "
+        f"the mean absolute error as a fraction of persistence's, the geometric mean over recordings and over {all_steps} "
         f"(1 less that: vs persistence; squared: 1 less the ratio of squared errors that are pooled over recordings)",
         "skill",
         cluster,

@@ -150,29 +150,30 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
     """
     fresh = [trial for trial in trials if not trial.seen and trial.windows]
     steps = headlines.headline_steps(range(1, horizon + 1))
-    at = [step - 1 for step in steps]
+    step_indices = [step - 1 for step in steps]
 
-    def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
-        sums_by_recording: dict[tuple[Any, str], AnyFloats] = {}
-        for trial in chosen:
-            errors, persistence = (
-                (sums.count_squared.sum(axis=1)[at], sums.count_absolute.sum(axis=1)[at])
-                for sums in (trial.errors[predictor], trial.errors[BASELINE])
-            )
-            channels = trial.errors[predictor].count_squared.shape[1]
-            sums_by_recording[0, trial.name] = headlines.sums(errors, persistence, trial.windows * channels)
-        return sums_by_recording
+    def errors_of(trial: Trial, predictor: str) -> tuple[AnyFloats, AnyFloats]:
+        sums = trial.errors[predictor]
+        return sums.count_squared.sum(axis=1)[step_indices], sums.count_absolute.sum(axis=1)[step_indices]
+
+    def sums_by_recording(predictor: str, part_trials: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
+        sums: dict[tuple[Any, str], AnyFloats] = {}
+        for trial in part_trials:
+            values = trial.windows * trial.errors[predictor].count_squared.shape[1]
+            sums[0, trial.name] = headlines.sums(errors_of(trial, predictor), errors_of(trial, BASELINE), values)
+        return sums
 
     has_objects = any(trial.object is not None for trial in fresh)
-    headlines_found = []
+    headline_list = []
     for part in (True, False) if has_objects else (None,):
-        chosen = [trial for trial in fresh if part is None or trial.known == part]
-        names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
-        baselines = {name: sums(name, chosen) for name in names}
-        objects = {trial.name: str(trial.object) for trial in chosen} if part is False else None
-        result = headlines.headline(method, steps, sums(MODEL, chosen), baselines, part, unit=unit, objects=objects)
-        headlines_found += [result] if result else []
-    return headlines_found
+        part_trials = [trial for trial in fresh if part is None or trial.known == part]
+        names = [name for name in (part_trials[0].errors if part_trials else ()) if name != MODEL]
+        model = sums_by_recording(MODEL, part_trials)
+        baselines = {name: sums_by_recording(name, part_trials) for name in names}
+        objects = {trial.name: str(trial.object) for trial in part_trials} if part is False else None
+        result = headlines.headline(method, steps, model, baselines, part, unit=unit, objects=objects)
+        headline_list += [result] if result else []
+    return headline_list
 
 
 def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: float) -> bytes:
@@ -195,10 +196,10 @@ def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: fl
 def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFloats) -> bytes:
     """Return the error sums as a Parquet table, so that results can be pooled by recording.
 
-    Each row is a recording, predictor, channel group and step, with the ``squared`` and ``absolute`` error sums and the
-    numbers of ``windows`` and ``channels`` that they were summed over. Channel groups are in counts. ``standard`` is
-    all channels in units of their standard deviation in training. ``feature`` and ``latent`` are the features of the
-    representation with and without the paper's scaling.
+    There is one row per recording, predictor, channel group and step, with the ``squared`` and ``absolute`` error sums and
+    the numbers of ``windows`` and ``channels`` that they were summed over. Errors of channel groups are in counts. The
+    group ``standard`` is all channels in units of their standard deviation in training; ``feature`` and ``latent`` are the
+    features of the representation with and without the paper's scaling.
     """
     columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS.names}
     for trial in trials:
@@ -259,7 +260,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
 
 
 def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardScores:
-    """Return each predictor's errors, skill and counts over the recordings that contain windows."""
+    """Return the errors of each predictor, the model's skill, and counts, over the recordings that contain windows."""
     evaluated = [item for item in trials if item.windows]
     windows = np.array([item.windows for item in evaluated], dtype=np.int64)
     counts: WindowCounts = {
@@ -279,21 +280,19 @@ def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
             "mae_counts": _group_errors(np.stack([item.count_absolute for item in errors]), windows, groups),
             "mse_standard": _steps(squared / channel_scale**2, windows),
         }
-        latent, feature = (
-            [sums for item in errors if (sums := getattr(item, attribute)) is not None]
-            for attribute in ("latent_squared", "feature_squared")
-        )
+        latent = [item.latent_squared for item in errors if item.latent_squared is not None]
         if latent:
             predictors[name]["mse_latent"] = _steps(np.stack(latent), windows)
+        feature = [item.feature_squared for item in errors if item.feature_squared is not None]
         if feature:
             predictors[name]["mse_feature"] = _steps(np.stack(feature), windows)
     units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
     kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
     skill = {
-        name_of: _intervals(
+        measure: _intervals(
             _error_sums_by_step(evaluated, MODEL, attribute), _error_sums_by_step(evaluated, BASELINE, attribute), units
         )
-        for name_of, attribute in kinds.items()
+        for measure, attribute in kinds.items()
     }
     model, persistence = (_error_sums_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
     skill[headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)

@@ -140,7 +140,7 @@ def rows_of_tracks(
     device: str = "cpu",
     mapped: MappedArrays | None = None,
 ) -> Rows:
-    """Return the concatenated rows of all tracks, and the windows at ``starts``, which are row numbers within each track.
+    """Return the concatenated rows of all tracks, with windows at ``starts``: for each track, row numbers within it.
 
     The rows are stored in files of ``mapped``, or in memory if it is None. Raises `StorageError` if the disk is full,
     and `TacpipeError` for unknown ``actions``.

@@ -125,21 +125,21 @@ class BySituation:
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
-    def _measures(self, at: int) -> SituationMeasures:
-        """Return the measures of the situation with the index ``at``."""
-        recordings = self._recordings(at)
-        count = sum(int(self.windows[name][at]) for name in recordings)
+    def _measures(self, index: int) -> SituationMeasures:
+        """Return the measures of the situation with the index ``index``."""
+        recordings = self._recordings(index)
+        count = sum(int(self.windows[name][index]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
-        errors = {name: self._sums(self.absolute, recordings, name, at).sum(axis=0) for name in predictors}
+        errors = {name: self._sums(self.absolute, recordings, name, index).sum(axis=0) for name in predictors}
         model, persistence = (
             np.hstack([sums, sums.sum(axis=1, keepdims=True)])
-            for sums in (self._sums(self.absolute, recordings, name, at) for name in (MODEL, BASELINE))
+            for sums in (self._sums(self.absolute, recordings, name, index) for name in (MODEL, BASELINE))
         )
         interval = intervals.geometric_skill_interval(model, persistence)
         skill: dict[str, dict[str, float]] = {}
-        for index, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"]):
-            ends = {part: getattr(interval, part)[index] for part in ("mean", "low", "high")}
-            skill[step] = {part: _round(value) for part, value in ends.items() if math.isfinite(value)}
+        for position, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"]):
+            bounds = {name: getattr(interval, name)[position] for name in ("mean", "low", "high")}
+            skill[step] = {name: _round(value) for name, value in bounds.items() if math.isfinite(value)}
         return {
             "windows": count,
             "recordings": len(recordings),

@@ -416,15 +416,12 @@ def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, .
     if not pose.position:
         return (), ()
     stream = field_metadata(schema.field(pose.position[0])).get("stream")
-    angles, speeds = (
-        tuple(
-            name
-            for name in tactile.columns(schema, quantity)
-            if field_metadata(schema.field(name)).get("stream") == stream
-        )
-        for quantity in ("joint_position", "joint_velocity")
-    )
-    return angles, speeds
+
+    def columns_of_arm(quantity: str) -> tuple[str, ...]:
+        names = tactile.columns(schema, quantity)
+        return tuple(name for name in names if field_metadata(schema.field(name)).get("stream") == stream)
+
+    return columns_of_arm("joint_position"), columns_of_arm("joint_velocity")
 
 
 def whole_numbers(table: pa.Table | Columns, name: str) -> Int64s:

@@ -138,9 +138,10 @@ class Answers:
         return is_known
 
     def _add_measures(self, sensor: str, slides: Slides, scores: Float32s, is_known: Bools, fresh: Bools) -> None:
-        """Add the measures and the rows of a sensor's slides, from their scores (slide, class) and two masks (slide,).
+        """Add the measures and the rows of a sensor's slides, given their scores (slide, class).
 
-        Only ``fresh`` slides, which were not used for training or validation, are measured.
+        ``is_known`` (slide,) marks slides of known materials, and ``fresh`` (slide,) slides that were not used for training
+        or validation; only these are measured.
         """
         sensor_calibration = self.classifier.calibrations[sensor]
         held_out = self.classifier.config.get("held_out", {}).get(sensor, [])
@@ -151,15 +152,12 @@ class Answers:
         score = scores_by_rule[sensor_calibration.rule]
         if learned.any():
             labels = np.searchsorted(self.classifier.classes, slides.materials[learned])
-            before, after = (
-                _probability_fit(scores[learned], labels, right[learned], divisor)
-                for divisor in (1.0, sensor_calibration.temperature)
-            )
+            temperature = sensor_calibration.temperature
             self.calibration[sensor] = {
                 "n": int(learned.sum()),
-                "temperature": sensor_calibration.temperature,
-                "before": before,
-                "after": after,
+                "temperature": temperature,
+                "before": _probability_fit(scores[learned], labels, right[learned], 1.0),
+                "after": _probability_fit(scores[learned], labels, right[learned], temperature),
             }
         if learned.any() or unknown.any():
             refused = score < sensor_calibration.threshold

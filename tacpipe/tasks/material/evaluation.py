@@ -309,26 +309,24 @@ def predictions_table(
 
     ``sessions`` maps slides to their sessions, if recorded.
     """
-    names_for, count = classifier.naming.names_for, {sensor: len(result.slides) for sensor, result in evaluated.items()}
+    names_for, results = classifier.naming.names_for, list(evaluated.values())
+    recordings = [name for result in results for name in result.slides.names]
+    sensors = [sensor for sensor, result in evaluated.items() for _ in result.slides.names]
+    materials = names_for(_concatenate(result.slides.materials for result in results))
+    session_values = [(sessions or {}).get(name) for name in recordings]
+    session_names = [None if session is None else str(session) for session in session_values]
     columns: list[tuple[pa.Field, Any]] = [
-        (pa.field("recording", pa.string()), [name for result in evaluated.values() for name in result.slides.names]),
-        (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
-        headlines.label_field(
-            "material", names_for(_concatenate(result.slides.materials for result in evaluated.values())), "label"
-        ),
-        (pa.field("seen", pa.bool_()), _concatenate(result.in_training for result in evaluated.values())),
+        (pa.field("recording", pa.string()), recordings),
+        (pa.field("sensor", pa.string()), sensors),
+        headlines.label_field("material", materials, "label"),
+        (pa.field("seen", pa.bool_()), _concatenate(result.in_training for result in results)),
+        (pa.field("session", pa.string()), session_names),
     ]
-    session_values = [(sessions or {}).get(name) for result in evaluated.values() for name in result.slides.names]
-    columns.append(
-        (pa.field("session", pa.string()), [None if session is None else str(session) for session in session_values])
-    )
-    for name in sorted({name for result in evaluated.values() for name in result.predicted}):
-        values = [
-            result.predicted.get(name, np.full(len(result.slides), headlines.UNKNOWN)) for result in evaluated.values()
-        ]
-        columns.append(headlines.label_field(name, names_for(_concatenate(values)), "prediction"))
-    columns += score_columns(classifier, _concatenate(result.output.scores for result in evaluated.values()))
-    latents = [result.output.latents for result in evaluated.values() if result.output.latents is not None]
+    for name in sorted({name for result in results for name in result.predicted}):
+        predicted = [result.predicted.get(name, np.full(len(result.slides), headlines.UNKNOWN)) for result in results]
+        columns.append(headlines.label_field(name, names_for(_concatenate(predicted)), "prediction"))
+    columns += score_columns(classifier, _concatenate(result.output.scores for result in results))
+    latents = [result.output.latents for result in results if result.output.latents is not None]
     if latents:
         columns += latent_columns(_concatenate(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]

@@ -31,7 +31,7 @@ class BoostedTrees:
     base: Floats  # (1,), the score before the first tree
 
     @classmethod
-    def fitted(
+    def fit(
         cls,
         rows: AnyFloats,
         labels: Bools,

@@ -97,7 +97,7 @@ class SlipCalibration:
     minutes: float
 
     @classmethod
-    def fitted(
+    def fit(
         cls,
         scores: AnyFloats,
         slips: Bools,
@@ -160,24 +160,24 @@ class EventScore:
 
 
 def score_events(track: ScoredTrack, level: float, horizon_ns: int) -> list[EventScore]:
-    """Return how an alarm did on each slip of a recording that has rows before it.
+    """Return lead and delay of the alarm at ``level`` for each slip of a recording; slips without earlier rows are left out.
 
-    An alarm that lasts from before a slip into it has no delay.
+    An alarm that starts before a slip and lasts into it has no delay.
     """
     results = []
     start_ns = int(track.t_ns[0]) - round(float(track.since_s[0]) * 1e9) if len(track.t_ns) else 0
-    on = track.scores >= level
+    is_alarm = track.scores >= level
     for begin, end in track.events.tolist():
-        before = (track.states == BEFORE) & (track.t_ns >= begin - horizon_ns) & (track.t_ns < begin)
-        during = (track.states == DURING) & (track.t_ns >= begin) & (track.t_ns <= end)
-        if not before.any():
+        is_before = (track.states == BEFORE) & (track.t_ns >= begin - horizon_ns) & (track.t_ns < begin)
+        is_during = (track.states == DURING) & (track.t_ns >= begin) & (track.t_ns <= end)
+        if not is_before.any():
             continue
-        early, late = track.t_ns[before & on], track.t_ns[during & on]
+        early, late = track.t_ns[is_before & is_alarm], track.t_ns[is_during & is_alarm]
         lead = (begin - int(early[0])) / 1e6 if len(early) else math.nan
         delay = (int(late[0]) - begin) / 1e6 if len(late) else math.nan
-        if on[before][-1]:
+        if is_alarm[is_before][-1]:
             delay = 0.0
-        first = [int(times[0]) for times in (early, late) if len(times)]
-        to_end = (end - min(first)) / 1e6 if first else math.nan
+        first_alarms_ns = [int(times[0]) for times in (early, late) if len(times)]
+        to_end = (end - min(first_alarms_ns)) / 1e6 if first_alarms_ns else math.nan
         results.append(EventScore(track.name, track.object, (begin - start_ns) / 1e9, lead, delay, to_end))
     return results

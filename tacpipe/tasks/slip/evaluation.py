@@ -87,38 +87,39 @@ class EvaluatedSlips:
         """Return the evaluation of windows, by the scores and probabilities (window,) of each predictor."""
         tracks = tuple(scored_tracks(windows, scores[MODEL]))
 
-        def split(values: Mapping[str, Floats]) -> dict[str, tuple[Floats, ...]]:
-            parts = [windows.track == number for number in range(len(tracks))]
-            return {name: tuple(column[part] for part in parts) for name, column in values.items()}
+        def split_by_track(values: Mapping[str, Floats]) -> dict[str, tuple[Floats, ...]]:
+            masks = [windows.track == index for index in range(len(tracks))]
+            return {name: tuple(column[mask] for mask in masks) for name, column in values.items()}
 
-        return cls(tracks, split(scores), split(probabilities), {track.name: levels for track in tracks})
+        return cls(
+            tracks, split_by_track(scores), split_by_track(probabilities), {track.name: levels for track in tracks}
+        )
 
     def pooled(self, others: Sequence[EvaluatedSlips]) -> EvaluatedSlips:
-        """Return this evaluation with those of further folds, matched for time again.
+        """Return this evaluation together with those of further folds, with weights that match times over all folds.
 
-        A recording that several folds test (``split --apart object``) counts once, in a fold that did not train on its
-        object if there is one.
+        A recording that several folds test (``split --apart object``) counts once, if possible in a fold that did not train
+        on its object.
         """
-        parts: dict[str, tuple[EvaluatedSlips, int]] = {}  # recording -> the fold that counts, and its index there
-        for part in (self, *others):
-            for index, track in enumerate(part.tracks):
-                if track.name not in parts or track.object not in part.known_objects:
-                    parts[track.name] = (part, index)
-        tracks = [part.tracks[index] for part, index in parts.values()]
+        fold_and_index: dict[str, tuple[EvaluatedSlips, int]] = {}  # recording -> its fold, and its index in that fold
+        for fold in (self, *others):
+            for index, track in enumerate(fold.tracks):
+                if track.name not in fold_and_index or track.object not in fold.known_objects:
+                    fold_and_index[track.name] = (fold, index)
+        tracks = [fold.tracks[index] for fold, index in fold_and_index.values()]
         since_s = np.concatenate([np.zeros(0), *(track.since_s for track in tracks)])
         slips = np.concatenate([np.zeros(0, bool), *(track.states > STABLE for track in tracks)])
         weights = match_time(since_s, slips)
         ends = np.cumsum([len(track.t_ns) for track in tracks])[:-1]
-        matched = [replace(track, weights=own) for track, own in zip(tracks, np.split(weights, ends), strict=True)]
-
-        def join(column: str) -> dict[str, tuple[Floats, ...]]:
-            return {
-                name: tuple(getattr(part, column)[name][index] for part, index in parts.values())
-                for name in self.scores
-            }
-
-        levels = {name: part.levels[name] for name, (part, _) in parts.items()}
-        return EvaluatedSlips(tuple(matched), join("scores"), join("probabilities"), levels)
+        matched = [
+            replace(track, weights=track_weights)
+            for track, track_weights in zip(tracks, np.split(weights, ends), strict=True)
+        ]
+        folds = fold_and_index.values()
+        scores = {name: tuple(fold.scores[name][index] for fold, index in folds) for name in self.scores}
+        probabilities = {name: tuple(fold.probabilities[name][index] for fold, index in folds) for name in self.scores}
+        levels = {name: fold.levels[name] for name, (fold, _) in fold_and_index.items()}
+        return EvaluatedSlips(tuple(matched), scores, probabilities, levels)
 
     def scored_by(self, predictor: str) -> list[ScoredTrack]:
         """Return the recordings with the scores of a predictor."""
@@ -199,37 +200,37 @@ class EvaluatedSlips:
 
     @classmethod
     def from_result(cls, result: Dataset) -> EvaluatedSlips:
-        """Return the evaluation that is stored in a result, with its folds matched for time again."""
+        """Return the evaluation that is stored in a result, with weights that match times over all its folds."""
         table = result.recordings[WINDOWS].table()
-        described = model_files.tree(result.files, EVENTS)
+        events_by_recording = model_files.tree(result.files, EVENTS)
         names = table["recording"].to_numpy(zero_copy_only=False)
         predictors = [name.removeprefix("score_") for name in table.column_names if name.startswith("score_")]
         values = {name: table[name].to_numpy() for name in table.column_names if name not in ("recording", "object")}
         tracks, rows_by_track = [], []
-        for name, own in sorted(described.items()):
+        for name, described in sorted(events_by_recording.items()):
             rows = np.flatnonzero(names == name)
             rows_by_track.append(rows)
-            events = np.array(own["slips"], np.int64).reshape(-1, 2)
+            slips = np.array(described["slips"], np.int64).reshape(-1, 2)
             since_s = values["since_s"][rows]
             tracks.append(
                 ScoredTrack(
                     name,
-                    str(own["object"]),
+                    str(described["object"]),
                     values["t_ns"][rows],
                     values["state"][rows].astype(np.int64),
                     values[f"score_{MODEL}"][rows],
-                    events,
+                    slips,
                     np.ones(len(rows)),
                     since_s,
                 )
             )
 
-        def column(prefix: str) -> dict[str, tuple[Floats, ...]]:
+        def column_by_track(prefix: str) -> dict[str, tuple[Floats, ...]]:
             return {name: tuple(values[f"{prefix}_{name}"][rows] for rows in rows_by_track) for name in predictors}
 
-        levels = {name: own["levels"] for name, own in described.items()}
+        levels = {name: described["levels"] for name, described in events_by_recording.items()}
         known = frozenset(model_files.tree(result.files, model_files.CONFIG, {"objects": list})["objects"])
-        return cls(tuple(tracks), column("score"), column("probability"), levels, known).pooled([])
+        return cls(tuple(tracks), column_by_track("score"), column_by_track("probability"), levels, known).pooled([])
 
 
 def brier_measure() -> Measure:

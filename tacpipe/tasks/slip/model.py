@@ -150,7 +150,7 @@ def calibrate(
         )
     scores = score_windows(model.scorer, windows)
     tracks_with_scores = scored_tracks(windows, scores)
-    calibration = SlipCalibration.fitted(
+    calibration = SlipCalibration.fit(
         scores, windows.slips, windows.weights, tracks_with_scores, "calibration recordings", model.horizon_ns
     )
     config = dict(model.config)

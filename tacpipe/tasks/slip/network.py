@@ -143,7 +143,7 @@ class ConvolutionScorer:
     runs_live: bool = True
 
     @classmethod
-    def fitted(cls, windows: TrainingWindows, params: ConvolutionParams, workspace: Path) -> ConvolutionScorer:
+    def fit(cls, windows: TrainingWindows, params: ConvolutionParams, workspace: Path) -> ConvolutionScorer:
         """Return a network that the shared loop trained."""
         work = WindowWork(windows, params.batch)
         described = {"inputs": work.shape[0], "channels": params.channels, "layers": params.layers}

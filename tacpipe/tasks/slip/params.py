@@ -38,18 +38,18 @@ class SlipModelParams(ABC):
     streams: Names = ""  # names of tactile streams to read; empty: all
     # time that the model looks back; 0: only the current row, whose channels are the features
     window_s: Annotated[float, Range(0, 60), Unit("s")] = 1.0
-    # time ahead for which the probability is stated; 0: the current row, such as whether a grasp is stable
+    # how far ahead a slip is predicted; 0: predict a slip in the current row, such as an unstable grasp
     horizon_s: Annotated[NonNegativeFloat, Unit("s")] = 1.0
-    # time at the start of a recording whose mean is the level at rest; 0: values are relative to rest already
+    # duration at the start of a recording whose mean is the rest level; 0: values are already relative to rest
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
-    # time after a slip that is neither slip nor stable contact
+    # duration after a slip that counts as neither slip nor stable contact
     recovery_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5
     stride: PositiveInt = 1  # rows between two training windows
     # weight training windows so that slip and stable contact have the same times since the start
     match_time: bool = True
-    # slips of each training recording: its own, or shuffled over recordings, to show what a wrong label would score
+    # labels of each training recording: its own, or another recording's, to measure the score with wrong labels
     labels: Literal["own", "shuffled"] = "own"
-    # planned: read the plans in the stream plan, from their arrival on; none: read touch only
+    # planned: also read plans from the stream plan, from their arrival on; none: read only touch
     actions: Literal["none", "planned"] = added("none")
     seed: Seed = 0  # random seed
     PANELS: ClassVar[Panels] = {
@@ -68,7 +68,7 @@ class SlipModelParams(ABC):
 
     @abstractmethod
     def fit(self, training: SlipTraining) -> Scorer:
-        """Return a scorer; ``training`` has the windows to train on, and the methods that the task offers."""
+        """Return a scorer trained with ``training``, which has the training windows and a method per kind of scorer."""
 
     @abstractmethod
     def load_scorer(self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader) -> Scorer:
@@ -135,7 +135,7 @@ class ForecastRule(SlipModelParams):
     def __post_init__(self) -> None:
         """Compute the digest of the forward model, which is part of the key.
 
-        Raises `UsageError` if ``forward_digest`` states another one.
+        Raises `UsageError` if ``forward_digest`` is another digest.
         """
         if not self.forward_model:
             return
@@ -179,8 +179,8 @@ class FingerConfig(TypedDict):
 
     stream: str
     channels: list[str]
-    layout: list[dict[str, str]]  # taxel and axis of each channel, as far as its metadata names them
-    rows: int  # rows of a window
+    layout: list[dict[str, str]]  # taxel and axis of each channel, if its metadata contains them
+    rows: int  # number of rows of a window
     rate_hz: float
     scale: list[float]  # (channel,), the divisor of values above rest
 
@@ -190,20 +190,22 @@ class CalibrationConfig(TypedDict):
 
     scores: list[float]  # (knot,), ascending
     probabilities: list[float]  # (knot,)
-    method: str  # recordings that it was fitted to: validation, or out-of-fold training recordings
-    levels: dict[str, float]  # false alarms per minute -> score from which an alarm is on
-    minutes: float  # stable contact that the levels were set on
+    method: str  # recordings that the map was fitted to: validation, or out-of-fold training recordings
+    levels: dict[str, float]  # false alarms per minute -> lowest score that raises an alarm
+    minutes: float  # duration of stable contact in the recordings that the levels were set on
 
 
 class SlipConfig(ModelConfig):
     """``config.json`` of a slip model."""
 
     fingers: list[FingerConfig]
-    rate_hz: float  # rows of the first finger per second, at which probabilities are stated
+    rate_hz: float  # rate of the first finger's rows, each of which gets a probability
     objects: list[str]  # objects of the training recordings
-    counts: dict[str, int]  # recordings, windows and slips of the training
+    counts: dict[str, int]  # numbers of training recordings, windows and slips
     calibration: CalibrationConfig
-    scorer: dict[str, object]  # what the architecture stores next to its arrays
-    baselines: dict[str, dict[str, object]]  # what each baseline stores next to its arrays
-    baseline_levels: dict[str, dict[str, float]]  # baseline -> false alarms per minute -> level of its score
+    scorer: dict[str, object]  # settings of the architecture that are not arrays
+    baselines: dict[str, dict[str, object]]  # baseline -> its settings that are not arrays
+    baseline_levels: dict[
+        str, dict[str, float]
+    ]  # baseline -> false alarms per minute -> lowest score that raises an alarm
     base_rate: float  # weighted fraction of training windows with a slip

@@ -91,13 +91,13 @@ class BoostedScorer(FeatureScorer):
     trees: BoostedTrees
 
     @classmethod
-    def fitted(cls, windows: TrainingWindows, params: Boosting, columns: Sequence[int] | None = None) -> BoostedScorer:
+    def fit(cls, windows: TrainingWindows, params: Boosting, columns: Sequence[int] | None = None) -> BoostedScorer:
         """Return a scorer trained on columns of the features, by default all but the time.
 
         Columns without two different values are left out.
         """
         chosen = _varying_columns(windows, columns)
-        trees = BoostedTrees.fitted(
+        trees = BoostedTrees.fit(
             windows.features[:, chosen],
             windows.slips,
             windows.weights,
@@ -135,7 +135,7 @@ class LinearScorer(FeatureScorer):
     base: Floats  # (1,), the log odds of a window of mean features
 
     @classmethod
-    def fitted(cls, windows: TrainingWindows) -> LinearScorer:
+    def fit(cls, windows: TrainingWindows) -> LinearScorer:
         """Return a scorer trained on all features but the time. Missing features count as their mean."""
         from sklearn.linear_model import LogisticRegression
 
@@ -202,10 +202,10 @@ def baseline_fits(reader: FingerReader, sizes: Boosting) -> dict[str, BaselineFi
     """Return the function that trains each baseline: trees of these sizes on few columns, and a linear model of all."""
 
     def boost(columns: Sequence[int]) -> BaselineFit:
-        return lambda windows, name: BoostedScorer.fitted(windows, sizes, columns)
+        return lambda windows, name: BoostedScorer.fit(windows, sizes, columns)
 
     fits = {name: boost(columns) for name, columns in baseline_columns(reader).items()}
-    return {**fits, LINEAR: lambda windows, name: LinearScorer.fitted(windows)}
+    return {**fits, LINEAR: lambda windows, name: LinearScorer.fit(windows)}
 
 
 def load_baseline(

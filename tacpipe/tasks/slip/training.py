@@ -45,13 +45,13 @@ class SlipTraining:
 
     def boost(self, params: Boosting) -> Scorer:
         """Return boosted trees on all features."""
-        return BoostedScorer.fitted(self.windows, params)
+        return BoostedScorer.fit(self.windows, params)
 
     def train_network(self, params: ConvolutionParams) -> Scorer:
         """Return a network that the shared loop trained."""
         from tacpipe.tasks.slip.network import ConvolutionScorer
 
-        return ConvolutionScorer.fitted(self.windows, params, self.workspace)
+        return ConvolutionScorer.fit(self.windows, params, self.workspace)
 
     def apply_rule(self, params: ForecastRule) -> Scorer:
         """Return the rule on forecasts, which learns nothing."""
@@ -140,7 +140,7 @@ def calibrate_scorer(
         tracks = scored_tracks(windows, scores)
     method = "out-of-fold training recordings" + (" and validation recordings" if held_out else "")
     all_scores, slips, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return SlipCalibration.fitted(all_scores, slips, weights, tracks, method, horizon_ns)
+    return SlipCalibration.fit(all_scores, slips, weights, tracks, method, horizon_ns)
 
 
 def scored_tracks(windows: TrainingWindows, scores: Floats) -> list[ScoredTrack]:

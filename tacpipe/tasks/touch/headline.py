@@ -64,9 +64,9 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
 
 
 def measure(range_counts: float, cluster: str) -> Measure:
-    """Return the RMSE of a target as a `Measure`, in fractions of its range of ``range_counts`` and in counts.
+    """Return a `Measure` of the RMSE of a target, as a fraction of its range of ``range_counts`` and in counts.
 
-    Its sums (draw, 2) are sums of squared errors and numbers of values; ``cluster`` names what is resampled.
+    Its sums (draw, 2) are the sum of squared errors and the number of values; ``cluster`` names the resampled unit.
     """
 
     def rmse(sums: AnyFloats) -> AnyFloats:

@@ -231,8 +231,8 @@ class Predictor:
             predicted_targets = {target for member in loaded_members for target in member.targets}
             if not config["targets"] or {*config["targets"]} != predicted_targets:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
-            shrunk = {name: value.numpy() for name, value in tensors_under(SHRINKAGE, tensors).items()}
-            shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
+            shrinkage_arrays = {name: value.numpy() for name, value in tensors_under(SHRINKAGE, tensors).items()}
+            shrinkage = Shrinkage.from_tensors(shrinkage_arrays, config["targets"]) if shrinkage_arrays else None
             quantiles = ReadingQuantiles.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
         return cls(params, config, loaded_members, baselines, chain, shrinkage, quantiles)
 

@@ -126,7 +126,7 @@ def _config(params: Params, targets: Sequence[str], training: Grasps, validation
 def _add_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> None:
     """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets with shared splits.
 
-    The leaf size of each forest minimises the out-of-bag error. With ``shrink_novel``, the shrinkage is fitted, too.
+    The leaf size of each forest minimises the out-of-bag error. With ``shrink_novel``, the shrinkage is also fitted.
     Raises `TacpipeError` if colours are missing.
     """
     training, targets = grasps.training, grasps.targets

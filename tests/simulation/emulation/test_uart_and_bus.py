@@ -7,23 +7,23 @@ from hypothesis import strategies as st
 
 from tacpipe.simulation.emulation.can import EXTENDED, frame_of, line, pack, split
 from tacpipe.simulation.emulation.endpoint import sent_sizes
-from tacpipe.simulation.emulation.serial_port import garbled
+from tacpipe.simulation.emulation.serial_port import garble
 
 
 @given(st.binary(max_size=200), st.sampled_from([9600, 115_200, 1_000_000]))
 def test_at_the_right_speed_bytes_are_read_as_they_were_sent(data: bytes, baud: int) -> None:
-    assert garbled(data, baud, baud) == data
+    assert garble(data, baud, baud) == data
 
 
 def test_at_half_the_speed_two_bits_are_read_as_one() -> None:
     # A5 is sent as 0 10100101 1, lowest bit first; at half the speed bits 3, 5, 7, 9 are seen, 1 0 0 1, and then rest
-    assert garbled(b"\xa5", 19_200, 9600) == bytes([0b11111001])
+    assert garble(b"\xa5", 19_200, 9600) == bytes([0b11111001])
 
 
 @pytest.mark.parametrize("off", [0.97, 1.03])
 def test_a_speed_that_is_off_by_three_percent_is_near_enough(off: float) -> None:
     data = bytes(range(256))
-    assert garbled(data, 115_200, round(115_200 * off)) == data
+    assert garble(data, 115_200, round(115_200 * off)) == data
 
 
 @given(

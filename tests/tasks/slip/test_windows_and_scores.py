@@ -73,7 +73,7 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
     sizes = {"learning_rate": 0.2, "max_leaf_nodes": 8, "min_samples_leaf": 5, "l2_regularization": 1.0}
     oracle = HistGradientBoostingClassifier(max_iter=20, early_stopping=False, random_state=3, **sizes)
     oracle.fit(rows, labels, sample_weight=weights)
-    trees = BoostedTrees.fitted(rows, labels, weights, trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3)
+    trees = BoostedTrees.fit(rows, labels, weights, trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3)
     assert trees.scores(rows) == pytest.approx(oracle.decision_function(rows), abs=1e-9)
     loaded = BoostedTrees.from_arrays(trees.arrays(), 5)
     assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
@@ -82,7 +82,7 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
 def test_the_linear_baseline_scores_as_the_regression_of_scikit_learn_does() -> None:
     reader, tracks = read_training(dataset(*trials(8)), Boosting())
     windows = read_windows(reader, tracks, Boosting(), stride=5)
-    scorer = LinearScorer.fitted(windows)
+    scorer = LinearScorer.fit(windows)
     columns, counted = list(scorer.columns), windows.weights > 0
     rows = windows.features[:, columns]
     scaler = StandardScaler().fit(rows[counted])
@@ -98,7 +98,7 @@ def test_the_linear_baseline_scores_as_the_regression_of_scikit_learn_does() -> 
 
 def test_trees_whose_nodes_lead_back_are_refused() -> None:
     rows = np.random.default_rng(0).normal(size=(100, 2))
-    trees = BoostedTrees.fitted(
+    trees = BoostedTrees.fit(
         rows, rows[:, 0] > 0, np.ones(100), trees=2, leaves=4, leaf=5, learning_rate=0.2, l2=1.0, seed=0
     )
     arrays_by_name = trees.arrays()
@@ -303,7 +303,7 @@ def test_probabilities_rise_with_the_score_and_are_calibrated_where_they_were_fi
     rng = np.random.default_rng(seed)
     scores = rng.normal(size=500)
     slips = rng.random(500) < 1 / (1 + np.exp(-2 * scores))
-    fitted = SlipCalibration.fitted(scores, slips, np.ones(500), [scored(scores, np.zeros(500, np.int64))], "x", 10**9)
+    fitted = SlipCalibration.fit(scores, slips, np.ones(500), [scored(scores, np.zeros(500, np.int64))], "x", 10**9)
     probabilities = fitted.probability(np.sort(scores))
     assert (np.diff(probabilities) >= 0).all()
     assert 0 < probabilities.min() <= probabilities.max() < 1

@@ -126,7 +126,7 @@ class LiveChain:
     ) -> None:
         """Create a chain from compatible parts; `for_model` checks them."""
         self._targets = targets
-        # Channels of streams of frames, by stream. None without the first frame of the session, to which they refer.
+        # channels computed from frames, by stream; None if the session's first frame, to which they refer, is missing
         self._cameras = dict(cameras or {})
         # indices of the quantiles in a band
         self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
@@ -141,9 +141,8 @@ class LiveChain:
                 self._grid.continue_from(stream, levels)
         self._rolling = Rolling(forecaster, continues=beginning is not None)
         self._arm = Arm(forecaster.orientation)
-        self._resting: list[_Row] | None = (
-            [] if beginning is None else None
-        )  # rows collected until the rest level is known
+        # rows collected until the rest level is known; None afterwards
+        self._resting: list[_Row] | None = [] if beginning is None else None
         self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
         self._plans = PlanHistory()
         self._late_plans = 0
@@ -340,11 +339,11 @@ class LiveChain:
         newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
         values = {name: columns[index] for name, columns in rows.values.items()}
         layout = self._layout
-        arm = self._arm.row(t_ns, *layout.placed(values))
+        arm = self._arm.row(t_ns, *layout.arm_state(values))
         return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
 
     def _forecast(self, row: _Row, *, skipped: bool) -> GridForecast:
-        """Add a row and return its forecast, without values until the rest level is known and the window is full."""
+        """Add a row and return its forecast, which has no values until the rest level is known and the window is full."""
         if self._resting is not None:
             first = self._resting[0] if self._resting else row
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:

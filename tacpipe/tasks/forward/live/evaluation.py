@@ -108,7 +108,7 @@ def _session(
 ) -> Session:
     """Compare the forecasts that a session published with those of the offline chain and model.
 
-    ``offline`` is the recording after the model's stages; ``steps`` are those whose errors are summed.
+    ``offline`` is the recording after the model's stages; errors are summed for ``steps``.
     """
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
@@ -116,19 +116,19 @@ def _session(
     chain = replay.build_chain(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
     forecasts = list(replay.iterate_forecasts(chain, tables))
     with_values = [forecast for forecast in forecasts if forecast.count is not None]
-    made_ns = np.array([forecast.t_ns for forecast in with_values], np.int64)
-    same, equal = measures.equality(
-        session.t_ns, session.values_and_quantiles(), made_ns, session.matching_rows(with_values)
+    offline_ns = np.array([forecast.t_ns for forecast in with_values], np.int64)
+    share_equal, equal = measures.equality(
+        session.t_ns, session.values_and_quantiles(), offline_ns, session.matching_rows(with_values)
     )
     latency = tables["latency"]
     track = forecaster.track(offline)
     predicted = _offline(forecaster, track)
     rows, sums = _errors(forecaster, chain, forecasts, session, track, predicted, steps)
     late = latency.column("late").to_numpy()
-    grew = times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
+    lateness_ns = times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
     return Session(
-        same,
-        _after(session.t_ns[~equal & np.isin(session.t_ns, made_ns)], grew, forecaster),
+        share_equal,
+        _after(session.t_ns[~equal & np.isin(session.t_ns, offline_ns)], lateness_ns, forecaster),
         rows,
         sums,
         latency.column("latency_ms").to_numpy().astype(np.float64),
@@ -168,7 +168,7 @@ def _errors(
     grid_ns = np.array(sorted(newest), np.int64)
     counts = track.tactile.stored if isinstance(track.tactile, Levels) else np.asarray(track.tactile)
     target_ns = measures.targets(grid_ns, row_ns, steps, period_ns if uniform else None)
-    flat = measures.at(track.t_ns, counts.astype(np.float64), track.groups, track.usable, target_ns.ravel())
+    flat = measures.interpolate(track.t_ns, counts.astype(np.float64), track.groups, track.usable, target_ns.ravel())
     ahead = flat.reshape(len(row_ns), len(steps), -1)  # (row, step, channel)
     now_ns = track.t_ns[predicted.now]
     nearest = np.clip(np.searchsorted(now_ns, row_ns - round(period_ns / 2)), 0, len(now_ns) - 1)
@@ -239,15 +239,15 @@ class Published:
         steps = sorted({int(end.partition("_q")[0]) for end in ends})
         levels = [level for level in trained_levels if any(end.endswith(f"_q{level}") for end in ends)]
 
-        def stacked(endings: Sequence[str]) -> Float32s:
-            values_at = np.empty((forecast.num_rows, len(endings), len(channels)), np.float32)
+        def stack_columns(endings: Sequence[str]) -> Float32s:
+            stacked = np.empty((forecast.num_rows, len(endings), len(channels)), np.float32)
             for index, ending in enumerate(endings):
                 for channel, name in enumerate(channels):
-                    values_at[:, index, channel] = forecast.column(f"{name}_{ending}").to_numpy()
-            return values_at
+                    stacked[:, index, channel] = forecast.column(f"{name}_{ending}").to_numpy()
+            return stacked
 
-        values = stacked([f"t{step}" for step in steps])
-        quantiles = stacked([f"t{step}_q{level}" for level, step in itertools.product(levels, steps)])
+        values = stack_columns([f"t{step}" for step in steps])
+        quantiles = stack_columns([f"t{step}_q{level}" for level, step in itertools.product(levels, steps)])
         return cls(times(forecast), tuple(steps), values, tuple(levels), quantiles)
 
     def values_and_quantiles(self) -> Float32s:

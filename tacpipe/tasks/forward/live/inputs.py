@@ -85,9 +85,10 @@ class InputLayout:
     def for_forecaster(
         cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = ""
     ) -> InputLayout:
-        """Find the inputs in streams with these schemas, by the params of the model's `synchronize`.
+        """Return the layout of the model's inputs in streams with the schemas ``layouts``.
 
-        Raises `TacpipeError` if a stream or a channel is missing or differs from the model's.
+        ``synchronize`` are the params of the stage in the model's chain. Raises `TacpipeError` if a stream or a channel is
+        missing or differs from the model's.
         """
         import pyarrow as pa
 
@@ -107,7 +108,7 @@ class InputLayout:
         columns: dict[str, list[str]] = {leader: []}
 
         def place_columns(names: Sequence[str]) -> Place | None:
-            """Add the columns of one stream to those that are read; return the stream and their indices in it."""
+            """Add columns of one stream to ``columns``; return the stream and their indices, or None without names."""
             if not names:
                 return None
             stream = origin[names[0]][0]
@@ -193,8 +194,8 @@ class InputLayout:
             by_stream[stream][columns] = np.asarray(rest_levels)[channels]
         return by_stream
 
-    def placed(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
-        """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, of a row."""
+    def arm_state(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
+        """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, from rows by stream."""
         position, quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         if self.position is not None:
             stream, columns = self.position

@@ -49,25 +49,27 @@ def equality(
     return result, equal
 
 
-def at(t_ns: Times, values: AnyFloats, groups: Int64s, usable: Bools, wanted_ns: Times) -> Floats:
-    """Return values (wanted, channel) at times, linear between rows (time, channel) of a group; NaN where there are none.
+def interpolate(t_ns: Times, values: AnyFloats, groups: Int64s, usable: Bools, target_ns: Times) -> Floats:
+    """Return values (target, channel) at ``target_ns``, interpolated between rows ``values`` (time, channel).
+
+    A value is NaN unless the rows before and after it are ``usable`` (time,) and in the same of ``groups`` (time,).
 
     >>> t_ns, values = np.array([0, 10, 20]), np.array([[0.0], [5.0], [7.0]])
     >>> groups, usable = np.array([0, 0, 1]), np.array([True, True, True])
-    >>> at(t_ns, values, groups, usable, np.array([5, 10, 15, 20, 21])).T.tolist()
+    >>> interpolate(t_ns, values, groups, usable, np.array([5, 10, 15, 20, 21])).T.tolist()
     [[2.5, 5.0, nan, 7.0, nan]]
     """
-    interpolated = np.full((len(wanted_ns), values.shape[1]), np.nan)
+    interpolated = np.full((len(target_ns), values.shape[1]), np.nan)
     if not len(t_ns):
         return interpolated
-    after = np.clip(np.searchsorted(t_ns, wanted_ns, side="left"), 0, len(t_ns) - 1)
-    before = np.where(t_ns[after] == wanted_ns, after, np.maximum(after - 1, 0))
-    inside = (wanted_ns >= t_ns[0]) & (wanted_ns <= t_ns[-1])
+    after = np.clip(np.searchsorted(t_ns, target_ns, side="left"), 0, len(t_ns) - 1)
+    before = np.where(t_ns[after] == target_ns, after, np.maximum(after - 1, 0))
+    inside = (target_ns >= t_ns[0]) & (target_ns <= t_ns[-1])
     inside &= usable[before] & usable[after] & (groups[before] == groups[after])
     first, last = before[inside], after[inside]
     span = np.maximum(t_ns[last] - t_ns[first], 1)
-    part = ((wanted_ns[inside] - t_ns[first]) / span)[:, None]
-    interpolated[inside] = values[first] * (1 - part) + values[last] * part
+    weight = ((target_ns[inside] - t_ns[first]) / span)[:, None]
+    interpolated[inside] = values[first] * (1 - weight) + values[last] * weight
     return interpolated
 
 

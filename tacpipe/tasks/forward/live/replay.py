@@ -76,7 +76,7 @@ def _predict_recording(
     *,
     allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
-    """Return the predictions of a recording, and the number of grid points by cause.
+    """Return the predictions of a recording, and how many grid points have each cause of a missing forecast.
 
     Raises `TacpipeError` for a step beyond the horizon, or streams that the model does not read.
     """
@@ -84,28 +84,25 @@ def _predict_recording(
     chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
-    places = [step - 1 for step in steps]
+    step_indices = [step - 1 for step in steps]
     for forecast in iterate_forecasts(chain, tables):
         causes.update(forecast.cause)
         if forecast.count is not None:
             t_ns.append(forecast.t_ns)
-            counts.append(forecast.count[places])
+            counts.append(forecast.count[step_indices])
         if forecast.quantiles is not None:
-            bands.append(forecast.quantiles[places])
-    shape = len(places), len(chain.channels)
-    stacked = np.stack(counts) if counts else np.zeros((0, *shape), np.float32)
-    levels = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
+            bands.append(forecast.quantiles[step_indices])
+    shape = len(step_indices), len(chain.channels)
+    all_counts = np.stack(counts) if counts else np.zeros((0, *shape), np.float32)
+    all_bands = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
     table = prediction_table(
         forecaster,
         np.array(t_ns, np.int64),
-        stacked.transpose(1, 2, 0).copy(),
+        all_counts.transpose(1, 2, 0).copy(),
         steps,
-        dict(zip(quantiles, levels.transpose(3, 1, 2, 0).copy(), strict=True)),
+        dict(zip(quantiles, all_bands.transpose(3, 1, 2, 0).copy(), strict=True)),
     )
-    described = {
-        f"forecast_{_name(cause)}": count
-        for cause, count in sorted(causes.items(), key=lambda forecast: forecast[0].value)
-    }
+    described = {f"forecast_{_name(cause)}": causes[cause] for cause in sorted(causes, key=lambda cause: cause.value)}
     return RecordingOutput(table, {"causal": True, **described}), causes
 
 

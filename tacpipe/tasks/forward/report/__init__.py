@@ -68,7 +68,7 @@ class ForwardReport(TaskReport):
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
         """Return further columns for the table of all methods: skill by step, errors in several units, and windows.
 
-        Each is a heading and a function that returns its cell in a row.
+        A column is its heading and a function that returns the cell of a row.
         """
         steps, known_objects = _steps(context), _known_objects(comparison.question)
         unit = comparison.measure.unit
@@ -78,13 +78,13 @@ class ForwardReport(TaskReport):
             sums = skill.sums_of_row(row, steps, known_objects, group)
             return skill.skill_intervals(sums) if sums else None
 
-        def squared(group: str) -> Callable[[ComparisonRow], Cell]:
+        def squared_error_column(group: str) -> Callable[[ComparisonRow], Cell]:
             return lambda row: number(
                 skill.mean_squared(skill.sums_of_row(row, _all_steps(context), known_objects, group))
             )
 
-        def at(place: int) -> Callable[[ComparisonRow], Cell]:
-            return lambda row: skill.skill_cell(skills(row, "both"), place)
+        def skill_column(index: int) -> Callable[[ComparisonRow], Cell]:
+            return lambda row: skill.skill_cell(skills(row, "both"), index)
 
         def windows(row: ComparisonRow) -> Cell:
             counts: dict[str, int] = {}
@@ -96,13 +96,13 @@ class ForwardReport(TaskReport):
             return Cell(f"{sum(counts.values()):,}", value=sum(counts.values()))
 
         return [
-            *((f"skill over persistence t+{step}", at(place)) for place, step in enumerate(steps)),
+            *((f"skill over persistence t+{step}", skill_column(index)) for index, step in enumerate(steps)),
             (
                 "skill over persistence, channels standardised",
                 lambda row: skill.skill_cell(skills(row, "standard"), -1),
             ),
-            (f"MSE ({unit}²)", squared("both")),
-            ("MSE (standardised)", squared("standard")),
+            (f"MSE ({unit}²)", squared_error_column("both")),
+            ("MSE (standardised)", squared_error_column("standard")),
             ("windows", windows),
         ]
 

@@ -95,17 +95,17 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
     steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in groups["both"]] + ["mean"]
     heads = ["", *(name.replace("t", "t+") if name != "mean" else name for name in steps)]
 
-    def cells(errors: Mapping[str, float]) -> list[Cell]:
+    def error_cells(errors: Mapping[str, float]) -> list[Cell]:
         return [number(errors[step]) for step in steps]
 
     absolute = {name: scores["mae_counts"]["both"] for name, scores in predictors.items()}
     squared = {name: scores["mse_counts"]["both"] for name, scores in predictors.items()}
     tables = [
-        table(title, heads, [[predictor_title(name), *cells(errors[name])] for name in names])
+        table(title, heads, [[predictor_title(name), *error_cells(errors[name])] for name in names])
         for title, errors in ((f"Mean absolute error ({unit})", absolute), (f"Mean squared error ({unit}²)", squared))
     ]
     rows: list[Sequence[str | Cell]] = [
-        [predictor_title(name), *cells(predictors[name]["mse_feature"])]
+        [predictor_title(name), *error_cells(predictors[name]["mse_feature"])]
         for name in names
         if "mse_feature" in predictors[name]
     ]
@@ -116,7 +116,7 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
     ]
     tables.append(table("Skill over persistence, with 95 % interval", heads, rows))
     rows = [
-        [f"{predictor_title(name)}, {group}", *cells(predictors[name]["mae_counts"][group])]
+        [f"{predictor_title(name)}, {group}", *error_cells(predictors[name]["mae_counts"][group])]
         for group in groups
         if group != "both"
         for name in names[:2]
@@ -124,18 +124,21 @@ def _error_tables(metrics: ForwardMetrics, names: Sequence[str], unit: str) -> l
     tables.append(table(f"Mean absolute error by sensor and axis ({unit})", heads, rows))
     rows = []
     for name in ("known", "unseen"):
-        part = metrics.parts.get(name)
-        if part and part.skill:
-            objects = f"{name} objects ({counted(part.counts['recordings'], 'recordings')})"
+        part_metrics = metrics.parts.get(name)
+        if part_metrics and part_metrics.skill:
+            objects = f"{name} objects ({counted(part_metrics.counts['recordings'], 'recordings')})"
             rows += [
                 [
                     f"{objects}, {predictor_title(predictor)} ({unit})",
-                    *cells(part.predictors[predictor]["mae_counts"]["both"]),
+                    *error_cells(part_metrics.predictors[predictor]["mae_counts"]["both"]),
                 ]
-                for predictor in _ordered_predictors(part)[:2]
+                for predictor in _ordered_predictors(part_metrics)[:2]
             ]
             rows.append(
-                [f"{objects}, skill", *(_error_cell(part.skill[headline.GEOMETRIC].get(step, {})) for step in steps)]
+                [
+                    f"{objects}, skill",
+                    *(_error_cell(part_metrics.skill[headline.GEOMETRIC].get(step, {})) for step in steps),
+                ]
             )
     return [*tables, table("Known and unseen objects: mean absolute error, and skill", heads, rows)] if rows else tables
 

@@ -68,7 +68,7 @@ class ErrorSums:
 
 
 def read_error_sums(content: bytes) -> ErrorSums:
-    """Return the sums in a file, without those of training recordings.
+    """Return the sums of errors in a Parquet file with the bytes ``content``, without those of training recordings.
 
     Raises `TacpipeError` if a column is missing, or predictors were evaluated on different windows.
     """
@@ -85,9 +85,10 @@ def read_error_sums(content: bytes) -> ErrorSums:
     table = pq.read_table(pa.BufferReader(owned(content)), columns=[*ERROR_COLUMNS, *objects])
     table = table.filter(np.logical_not(table["seen"].to_numpy()))
     has_objects = not objects or table["object"].null_count < table.num_rows or not table.num_rows
-    (predictors, predictor), (groups, group), (recordings, recording) = (
-        _encode_text(table[name]) for name in ("predictor", "group", "recording")
-    )
+    # distinct names, and the index of each row's name
+    predictors, predictor = _encode_text(table["predictor"])
+    groups, group = _encode_text(table["group"])
+    recordings, recording = _encode_text(table["recording"])
     steps, step = np.unique(table["step"].to_numpy(), return_inverse=True)
     windows = np.zeros(len(recordings), dtype=np.int64)
     windows[recording] = table["windows"].to_numpy()

@@ -127,47 +127,49 @@ def representation_folds(context: Context) -> list[Fold]:
 def represent_method(method: Method) -> Representation | None:
     """Return a method's errors in its own scaled space, or None if the results do not contain them."""
 
-    def error(run: ComparedRun, predictor: str, known_objects: bool | None = None) -> float | None:
+    def error(run: ComparedRun, predictor: str, known_errors: bool | None = None) -> float | None:
         steps = run.details.errors.steps
-        error_sums = list(methods.sums_by_recording(run.details, predictor, steps, known_objects, "feature").values())
+        error_sums = list(methods.sums_by_recording(run.details, predictor, steps, known_errors, "feature").values())
         total = np.sum(error_sums, axis=0) if error_sums else None
         return None if total is None else float((total[: len(steps)] / total[-1]).mean())
 
-    def errors_over_runs(predictor: str, known_objects: bool | None = None) -> list[float]:
-        return [value for run in method.runs if (value := error(run, predictor, known_objects)) is not None]
+    def errors_over_runs(predictor: str, known_errors: bool | None = None) -> list[float]:
+        errors = [error(run, predictor, known_errors) for run in method.runs]
+        return [value for value in errors if value is not None]
 
-    tested, known_objects = errors_over_runs(MODEL), errors_over_runs(MODEL, True)
-    if not tested:
+    test_errors, known_errors = errors_over_runs(MODEL), errors_over_runs(MODEL, True)
+    if not test_errors:
         return None
-    # the recurrent model is trained with this error, so its loss is a result, too
-    validation = [run.details.config.get("validation", {}) for run in method.runs]
-    described = [
-        tree.get("mse_feature", tree.get("loss") if methods.is_recurrent(method) else None) for tree in validation
-    ]
+    validation_errors = []
+    for run in method.runs:
+        validation = run.details.config.get("validation", {})
+        # a recurrent model is trained with this error, so its loss is the same quantity
+        loss = validation.get("loss") if methods.is_recurrent(method) else None
+        validation_errors.append(validation.get("mse_feature", loss))
     return Representation(
-        spread([float(tree) for tree in described if tree is not None]),
-        spread(tested),
-        spread(known_objects) if known_objects else None,
+        spread([float(value) for value in validation_errors if value is not None]),
+        spread(test_errors),
+        spread(known_errors) if known_errors else None,
         spread(errors_over_runs("persistence")),
     )
 
 
 def _representation_table(context: Context) -> Table | None:
-    """Return the results of the recurrent model on each representation, as in Table 1 if the data are the paper's.
+    """Return a table of the recurrent model's results on each representation; None if there are no such results.
 
-    None if no recurrent model has them.
+    If the data are the paper's, the table also contains the paper's numbers.
     """
     published, order = context.published, list(PRINTED)
     recurrent_methods = [represented for represented in context.methods if methods.is_recurrent(represented)]
 
-    def place(method: Method) -> tuple[int, str, int, str]:
+    def paper_order(method: Method) -> tuple[int, str, int, str]:
         codec = methods.codec_of(method)
         row = methods.paper_row(codec)
         return order.index(row) if row else len(order), str(codec["kind"]), int(codec["latents"]), method.name
 
     has_objects = any(run.details.errors.named for method in recurrent_methods for run in method.runs)
     rows: list[list[str | Cell]] = []
-    for method in sorted(recurrent_methods, key=place):
+    for method in sorted(recurrent_methods, key=paper_order):
         represented = represent_method(method)
         if represented is None:
             continue

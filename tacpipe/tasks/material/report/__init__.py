@@ -51,35 +51,39 @@ class MaterialReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return counts, skill over the mean level, last epoch and the paper's numbers: heads and functions of a row."""
+        """Return further columns: counts, skill over the mean level, accuracy of the last epoch, and the paper's numbers.
+
+        A column is its heading and a function that returns the cell of a row.
+        """
         runs = [run for run in context.runs if comparison.question in run.questions]
         sensor = next(s for run in runs for s in run.details.sensors if question_on(run, s) == comparison.question)
 
         def runs_of(row: ComparisonRow) -> list[ComparedRun]:
             return row.method.of(comparison.question)
 
-        def named_right(row: ComparisonRow) -> Cell:
-            counted = row.predictor != headline.CHANCE  # chance predicts no material
-            return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
+        def accuracy_cell(row: ComparisonRow) -> Cell:
+            if row.predictor == headline.CHANCE:  # chance predicts no material
+                return scores.accuracy_cell(None)
+            return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor))
 
-        def last(row: ComparisonRow) -> Cell:
-            counted = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
-            return Cell(scores.format_percent(counted.fraction), value=counted.fraction) if counted else Cell(NONE)
+        def last_epoch_cell(row: ComparisonRow) -> Cell:
+            accuracy = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
+            return Cell(scores.format_percent(accuracy.fraction), value=accuracy.fraction) if accuracy else Cell(NONE)
 
-        def paper(row: ComparisonRow) -> Cell:
+        def paper_cell(row: ComparisonRow) -> Cell:
             value = joint.ACCURACIES.get(row.family, {}).get(sensor) if row.kind == "model" else None
             return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
 
         more_columns: list[tuple[str, Callable[[ComparisonRow], Cell]]] = [
-            ("slides named right", named_right),
+            ("slides named right", accuracy_cell),
             (
                 "skill over the mean level",
                 lambda row: blocks.number(scores.level_skill(runs_of(row), sensor, row.predictor), 3),
             ),
         ]
         if any(LAST in run.details.predictions.predicted for run in runs):
-            more_columns.append(("last epoch (%)", last))
-        return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
+            more_columns.append(("last epoch (%)", last_epoch_cell))
+        return [*more_columns, ("paper, Table I (%)", paper_cell)] if context.published else more_columns
 
     def folds(self, context: Context) -> list[Fold]:
         """Return the folds that are specific to materials."""
@@ -132,25 +136,25 @@ def _describe_pooling(methods: Sequence[Method]) -> str:
     published = all(method.published for method in methods)
     predicted = {name for run in runs for name in run.predictions.predicted}
     sentences = [
-        (
-            "Correctly classified slides: accuracy ± standard deviation over runs; in small print, accuracy over all "
-            "slides of all runs of the method, then the 95 % interval (Wilson) over slides, each counted once."
-        ),
-        "Networks have the weights with the best validation accuracy, unless the name states otherwise."
-        if any(run.history for run in runs)
-        else "",
-        f"Last epoch: the weights of the last one{', which the paper’s code reports' if published else ''}."
-        if LAST in predicted
-        else "",
-        "Skill is 1 − errors / errors of the mean level, a linear readout of the time-averaged channels."
-        if LEVEL in predicted
-        else "",
-        "Mapping to a known space is reported for the sensor that was mapped to the other's."
-        if any(method.settings["frozen_sensor"] for method in methods)
-        else "",
-        joint.PRINTED_BASIS if published else "",
+        "Correctly classified slides: accuracy ± standard deviation over runs; in small print, accuracy over all "
+        "slides of all runs of the method, then the 95 % interval (Wilson) over slides, each counted once."
     ]
-    return " ".join(filter(None, sentences))
+    if any(run.history for run in runs):
+        sentences.append(
+            "Networks have the weights with the best validation accuracy, unless the name states otherwise."
+        )
+    if LAST in predicted:
+        paper = ", which the paper’s code reports" if published else ""
+        sentences.append(f"Last epoch: the weights of the last one{paper}.")
+    if LEVEL in predicted:
+        sentences.append(
+            "Skill is 1 − errors / errors of the mean level, a linear readout of the time-averaged channels."
+        )
+    if any(method.settings["frozen_sensor"] for method in methods):
+        sentences.append("Mapping to a known space is reported for the sensor that was mapped to the other's.")
+    if published:
+        sentences.append(joint.PRINTED_BASIS)
+    return " ".join(sentences)
 
 
 def _describe_basis(methods: Sequence[Method]) -> str:
@@ -159,9 +163,9 @@ def _describe_basis(methods: Sequence[Method]) -> str:
     for sensor in sensors_of(methods):
         slides = [run.details.predictions.of(sensor) for method in methods for run in runs_on(method, sensor)]
         names = {str(name) for slide in slides for name in slide.recordings}
-        trained = sorted({run.learned[sensor] for method in methods for run in method.details if sensor in run.learned})
-        counts = f" after training on {blocks.listed([f'{count:,}' for count in trained])}" if trained else ""
-        sentences.append(f"{len(names):,} slides of {sensor}{counts}")
+        counts = sorted({run.learned[sensor] for method in methods for run in method.details if sensor in run.learned})
+        training = f" after training on {blocks.listed([f'{count:,}' for count in counts])}" if counts else ""
+        sentences.append(f"{len(names):,} slides of {sensor}{training}")
     settings, runs = {}, [run for method in methods for run in method.details]
     for name in ("seed", "epochs"):
         values = {run.params[name] for run in runs if name in run.params and (name == "seed" or run.history)}

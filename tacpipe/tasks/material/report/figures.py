@@ -242,9 +242,9 @@ def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
 def count_nearest_partners(
     first: SlidePredictions, second: SlidePredictions, partners: Mapping[int, int]
 ) -> tuple[int, int]:
-    """Return how many materials are nearest to their partner by class means, and how many were compared.
+    """Return how many materials' mean latents are nearest to those of their partner, and how many were compared.
 
-    All latents are used. ``partners`` maps materials to those of the other sensor; missing materials map to themselves.
+    ``partners`` maps materials to those of the other sensor; missing materials map to themselves.
     """
     first_materials, second_materials = np.unique(first.materials), np.unique(second.materials)
     means = [
@@ -312,9 +312,9 @@ def _latent_rows(
 
 
 def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str], list[SlidePredictions]] | None:
-    """Return two sensors and the rows of each, from the first run that contains both, else from the first run of each.
+    """Return two sensors and their predictions, from the first run with both sensors, else from the first run of each.
 
-    None without latents of two sensors in spaces of equal dimension.
+    None if no two sensors have latents of equal dimension.
     """
     with_latents = [run for run in runs if run.predictions.latents is not None]
     sensors = ordered_sensors([sensor for run in with_latents for sensor in run.sensors])[:2]
@@ -322,10 +322,10 @@ def _paired_predictions(runs: Sequence[MaterialResult]) -> tuple[tuple[str, str]
         return None
     joint_run = next((run for run in with_latents if set(sensors) <= set(run.sensors)), None)
     runs_by_sensor = [joint_run or next(run for run in with_latents if sensor in run.sensors) for sensor in sensors]
-    parts = [run.predictions.of(sensor) for run, sensor in zip(runs_by_sensor, sensors, strict=True)]
-    if len({_part_latents(part).shape[1] for part in parts}) > 1:
+    predictions = [run.predictions.of(sensor) for run, sensor in zip(runs_by_sensor, sensors, strict=True)]
+    if len({_part_latents(part).shape[1] for part in predictions}) > 1:
         return None
-    return (sensors[0], sensors[1]), parts
+    return (sensors[0], sensors[1]), predictions
 
 
 def _part_latents(part: SlidePredictions) -> AnyFloats:

@@ -79,7 +79,7 @@ def joint_effects(methods: Sequence[Method]) -> list[str]:
 
 
 def describe_control(joint: Method, permuted: Method | None) -> str:
-    """Return what training on permuted pairs implies for the alignment of real pairs, if there is any."""
+    """Return sentences on whether the alignment of real pairs is better than that of pairs of permuted materials."""
     if permuted is None:
         return NO_CONTROL
     alignments = [_last_alignment(item) for item in (joint, permuted)]
@@ -89,14 +89,10 @@ def describe_control(joint: Method, permuted: Method | None) -> str:
             "The run with permuted materials has neither a latent difference nor exchanged classifiers, so it cannot "
             "be evaluated."
         )
-    costs = [
-        {
-            name: counted.fraction - swaps[index][name].fraction
-            for name in swaps[0]
-            if (counted := accuracy(runs_on(item, name), name))
-        }
-        for index, item in enumerate((joint, permuted))
-    ]
+    costs: list[dict[str, float]] = []  # loss of accuracy by exchanging classifiers, by sensor
+    for method, swapped in zip((joint, permuted), swaps, strict=True):
+        before = {sensor: accuracy(runs_on(method, sensor), sensor) for sensor in swaps[0]}
+        costs.append({name: own.fraction - swapped[name].fraction for name, own in before.items() if own})
     if max(costs[0].values()) > MAX_SWAP_LOSS:
         return (
             "Even real pairs are not aligned: with exchanged classifiers, the accuracy is "
@@ -198,8 +194,8 @@ def swap_table(methods: Sequence[Method]) -> Table | None:
         return blocks.table(title, heads, rows)
     printed_cells: list[str | Cell] = []
     for sensor in sensors:
-        before, after = (item.get(sensor, math.nan) for item in (ACCURACIES["RAEC joint"], PRINTED_SWAPPED))
-        printed_cells += [*(blocks.fixed(value, 2) for value in (before, after)), blocks.signed(after - before, 1)]
+        before, after = ACCURACIES["RAEC joint"].get(sensor, math.nan), PRINTED_SWAPPED.get(sensor, math.nan)
+        printed_cells += [blocks.fixed(before, 2), blocks.fixed(after, 2), blocks.signed(after - before, 1)]
     rows.append(["paper: RAEC joint", *printed_cells, NONE])
     return blocks.table(title, heads, rows, {len(rows) - 1: "quiet"})
 
@@ -380,7 +376,7 @@ def zero_shot_sentences(methods: Sequence[Method]) -> list[str]:
 
 
 def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
-    """Return the runs with held-out materials, grouped if they differ only in these materials, by sensor."""
+    """Return the runs with held-out materials by sensor and group of methods that differ only in these materials."""
     groups: dict[str, list[Method]] = {}
     for method in methods:
         if any("zero_shot" in result.metrics for result in method.details):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -88,15 +89,11 @@ class SessionAlarms:
     minutes: float  # stable contact
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as JSON; null where there is none."""
-        slips = [
-            {
-                name: round(value, 3) if value == value else None
-                for name, value in dataclasses.asdict(event).items()
-                if isinstance(value, float)
-            }
-            for event in self.events
-        ]
+        """Return the measures as a JSON object, with null for NaN."""
+        slips = []
+        for event in self.events:
+            times = {name: value for name, value in dataclasses.asdict(event).items() if isinstance(value, float)}
+            slips.append({name: None if math.isnan(value) else round(value, 3) for name, value in times.items()})
         return {"slips": slips, "false_alarms": self.false_alarms, "minutes": round(self.minutes, 4)}
 
 

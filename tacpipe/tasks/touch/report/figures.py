@@ -175,12 +175,12 @@ def _electrode_chart(rows: GraspPredictions, grasp: DrawnGrasp, fingers: Sequenc
 
 
 def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[charts.DataRow]:
-    """Return the electrodes of one fingertip with its skin unrolled, tip up, coloured from -1 to 1."""
+    """Return a data row per electrode: its position on the unrolled skin of a fingertip, and its ``strength`` in [-1, 1]."""
     positions_mm = 1000 * biotac_sp.unrolled_positions_m()[:, ::-1]  # (electrode, across and along), mm
     return [
-        {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
+        {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(value, -1, 1)), 2), "text": text,
          "Electrode": number, quantity: text}
-        for number, ((x, y), part, text) in enumerate(zip(positions_mm, strength, texts, strict=True), 1)
+        for number, ((x, y), value, text) in enumerate(zip(positions_mm, strength, texts, strict=True), 1)
     ]  # fmt: skip
 
 
@@ -282,12 +282,15 @@ def figure_8(methods: Sequence[Method]) -> list[Chart]:
     ]
     if not candidates:
         return []
-    method, target = max(
-        candidates,
-        key=lambda candidate: (len(_loss_curves(candidate[0], candidate[1], "train_loss")[0]), len(candidate[0].runs)),
-    )
+
+    def epochs_and_runs(candidate: tuple[Method, str]) -> tuple[int, int]:
+        method, target = candidate
+        return len(_loss_curves(method, target, "train_loss")[0]), len(method.runs)
+
+    method, target = max(candidates, key=epochs_and_runs)
     loss_names = {"training": "train_loss", "validation": "val_loss"}
-    curves = {name: described for name, loss in loss_names.items() if (described := _loss_curves(method, target, loss))}
+    all_curves = {name: _loss_curves(method, target, loss) for name, loss in loss_names.items()}
+    curves = {name: losses for name, losses in all_curves.items() if losses}
     quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
     text = f"training and validation loss by epoch, {method.name}, {headlines.TARGETS.get(target, 'all targets')}"
     note = " The paper's figure has 1,000 epochs." if method.published else ""

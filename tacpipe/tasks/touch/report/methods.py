@@ -108,7 +108,7 @@ def method_names(results: Sequence[TouchResult]) -> list[str]:
 
 
 def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
-    """Return the questions: split of the grasps, and whether they were simulated.
+    """Return the distinct questions of results: the split of the grasps, and whether they were simulated.
 
     Recorded grasps precede simulated ones; then splits are sorted by use of the default method, number of targets and
     runs.
@@ -117,16 +117,12 @@ def ordered_splits(results: Sequence[TouchResult]) -> list[tuple[str, bool]]:
     for result in results:
         by_split.setdefault((result.split, result.simulated), []).append(result)
 
-    def sort_key(key: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
-        results_of_split = by_split[key]
-        targets = {target for result_of_split in results_of_split for target in result_of_split.predictions.targets}
-        return (
-            key[1],
-            all(result_of_split.architecture != DEFAULT for result_of_split in results_of_split),
-            -len(targets),
-            -len(results_of_split),
-            key[0],
-        )
+    def sort_key(question: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
+        split, is_simulated = question
+        runs = by_split[question]
+        targets = {target for run in runs for target in run.predictions.targets}
+        lacks_default = all(run.architecture != DEFAULT for run in runs)
+        return is_simulated, lacks_default, -len(targets), -len(runs), split
 
     return sorted(by_split, key=sort_key)
 
@@ -268,15 +264,15 @@ def describe_schedule(run: TouchResult) -> str:
 
 
 def describe_training(methods: Sequence[Method]) -> str:
-    """Return the preset, the number of runs and the number of training grasps of a table's methods, in words."""
-    runs = [run for schedule in methods for run in schedule.details]
+    """Return sentences with the schedule, the number of runs and the number of training grasps of a table's methods."""
+    runs = [run for method in methods for run in method.details]
     described = [
         f"{count} run{'s' if count > 1 else ''}: {schedule}"
         for schedule, count in Counter(describe_schedule(run) for run in runs).most_common()
     ]
-    trained = sorted({run.trained for run in runs if run.trained is not None})
-    counts = f" Trained on {format_span(trained)} grasps." if trained else ""
-    return f"{'; '.join(described)}.{counts}"
+    grasp_counts = sorted({run.trained for run in runs if run.trained is not None})
+    training = f" Trained on {format_span(grasp_counts)} grasps." if grasp_counts else ""
+    return f"{'; '.join(described)}.{training}"
 
 
 def format_span(counts: Sequence[int]) -> str:

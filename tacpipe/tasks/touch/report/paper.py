@@ -109,9 +109,9 @@ def score_cells(result: Score | None) -> list[str | Cell]:
 
 
 def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | None) -> list[tuple[str, Score | None]]:
-    """Return the table name and score of the mandatory baselines and any others in the methods' results.
+    """Return title and score of the mandatory baselines, then of the further predictors in the methods' results.
 
-    The score is None without predictions of the target.
+    The score is None if there are no predictions of the target.
     """
     runs_by_method = {method.name: predictions_of_runs(method) for method in methods}
     all_runs = [run for runs in runs_by_method.values() for run in runs]
@@ -121,7 +121,7 @@ def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | 
         holding = [
             runs for runs in runs_by_method.values() if any(target in run.predicted.get(predictor, ()) for run in runs)
         ]
-        most_runs = max(holding, key=len, default=[])  # runs of one method: all of a split have the same baselines
+        most_runs = max(holding, key=len, default=[])  # all methods of a split have the same baselines
         rows.append((baseline_name(predictor), predictions.score(most_runs, target, known_objects, predictor)))
     return rows
 
@@ -132,7 +132,7 @@ def predictions_of_runs(method: Method) -> list[GraspPredictions]:
 
 
 def _table_by_object(method: Method) -> Table | None:
-    """Return a method's errors by object, with those of the object's mean, or None without unseen grasps."""
+    """Return a table of a method's errors by object above the errors of the object's mean; None without unseen grasps."""
     predicted, runs = predicted_targets(method), predictions_of_runs(method)
     rows: list[list[str | Cell]] = []
     kinds: dict[int, str] = {}
@@ -279,7 +279,8 @@ def _setting_table(form: Form, methods: Sequence[Method]) -> list[Block]:
         return []
     published = all(item.published for item in by_value.values())
     scores = {value: score_on_target(by_value[value]) if value in by_value else None for value in form.names}
-    best_name = min((item.each.mean, name) for value, name in form.names.items() if (item := scores[value]))[1]
+    errors = {form.names[value]: score.each.mean for value, score in scores.items() if score}
+    best_name = min(errors, key=lambda name: (errors[name], name))
     shown_names = {value: name for value, name in form.names.items() if published or scores[value]}
     rows: list[list[str | Cell]] = [
         [name, *score_cells(scores[value]), *(_printed_setting(form, value) if published else [])]
@@ -376,27 +377,20 @@ def _generalisation_table(known_method: Method, novel: Method) -> list[Block]:
     pairs: list[tuple[Score | None, Score | None]] = []
     kinds: dict[int, str] = {}
     for target, name in headlines.TARGETS.items():
-        test, novel_score = (
-            predictions.score(predictions_of_runs(item), target, known_objects)
-            for item, known_objects in ((known_method, True), (novel, False))
-        )
-        if test is None and novel_score is None:
+        test_score = predictions.score(predictions_of_runs(known_method), target, True)
+        novel_score = predictions.score(predictions_of_runs(novel), target, False)
+        if test_score is None and novel_score is None:
             continue
-        pairs.append((test, novel_score))
-        rows.append([name, *_pair_cells(test, novel_score), *(_printed_target(target) if published else [])])
-        baselines = zip(
-            *(
-                baseline_rows([item], target, known_objects)
-                for item, known_objects in ((known_method, True), (novel, False))
-            ),
-            strict=False,
-        )
-        for (title_of_baseline, first), (_, second) in baselines:
+        pairs.append((test_score, novel_score))
+        rows.append([name, *_pair_cells(test_score, novel_score), *(_printed_target(target) if published else [])])
+        test_baselines = baseline_rows([known_method], target, True)
+        novel_baselines = baseline_rows([novel], target, False)
+        for (title, test_baseline), (_, novel_baseline) in zip(test_baselines, novel_baselines, strict=False):
             kinds[len(rows)] = "quiet"
             rows.append(
                 [
-                    f"· {title_of_baseline.partition(':')[0]}",
-                    *_pair_cells(first, second),
+                    f"· {title.partition(':')[0]}",
+                    *_pair_cells(test_baseline, novel_baseline),
                     *([NONE] * 3 if published else []),
                 ]
             )

@@ -36,19 +36,15 @@ STRONGEST = 0.2  # coverage error with the most saturated colour
 def quantile_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return sections on the quality of quantiles of calibrated models; empty if there are none."""
     folds: list[Fold] = []
-    has_several_splits = (
-        len(ordered_splits([electrode_chart for method in methods for electrode_chart in method.details])) > 1
-    )
+    has_several_splits = len(ordered_splits([run for method in methods for run in method.details])) > 1
     for method in methods:
         coverage_rows = read_coverage([run.dataset for run in method.runs])
         if coverage_rows is None:
             continue
         levels = method.details[0].config["quantiles"]["levels"]
         level = (levels[-1] - levels[0]) / 100
-        parts = [
-            (known_objects, coverage_rows[coverage_rows.known == known_objects]) for known_objects in (True, False)
-        ]
-        evaluated = [(known_objects, rows) for known_objects, rows in parts if len(rows)]
+        rows_by_known = {known: coverage_rows[coverage_rows.known == known] for known in (True, False)}
+        evaluated = [(known_objects, rows) for known_objects, rows in rows_by_known.items() if len(rows)]
         heads = (
             "",
             "values",
