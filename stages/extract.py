@@ -67,10 +67,10 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.video.channels import DifferenceChannels
 
-    def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+    def compute(subject: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
         if params.rows > video_format.height_px or params.columns > video_format.width_px:
             raise TacpipeError(
-                f"{place}: frames have {video_format.width_px} x {video_format.height_px} pixels, and the grid "
+                f"{subject}: frames have {video_format.width_px} x {video_format.height_px} pixels, and the grid "
                 f"{params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
             )
         channels = DifferenceChannels(params.rows, params.columns, params.reference_frames)
@@ -110,8 +110,8 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     """
     from tacpipe.video.channels import MarkerChannels
 
-    def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
-        channels = MarkerChannels(params.rows, params.columns, params.pitch_mm, place)
+    def compute(subject: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+        channels = MarkerChannels(params.rows, params.columns, params.pitch_mm, subject)
         return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
@@ -221,9 +221,9 @@ def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
 def _replace_frames(
     recording: Recording, compute: Callable[[str, Columns, VideoFormat], pa.RecordBatchReader]
 ) -> RecordingOutput:
-    """Return a recording with its streams of frames replaced by ``compute``, whose first argument is the name for errors.
+    """Return a recording with its streams of frames replaced by the streams that ``compute`` returns.
 
-    Raises `TacpipeError` if there is no such stream.
+    The first argument of ``compute`` names recording and stream for errors. Raises `TacpipeError` if no stream has frames.
     """
     from tacpipe.video.stream import read_format
 
@@ -256,7 +256,7 @@ def _copy_stream(columns: Columns) -> pa.RecordBatchReader:
 def _stream_of_values(
     columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]
 ) -> pa.RecordBatchReader:
-    """Return a lazy stream with the clocks of ``columns`` and the ``values``, pairs of row number and values (field,)."""
+    """Return a lazy stream with the clocks of ``columns`` and ``values``, an iterator of row index and values (field,)."""
     import pyarrow as pa
 
     from tacpipe.video.channels import CLOCKS
@@ -280,7 +280,7 @@ def _stream_of_values(
 def _channel_values(
     columns: Columns, video_format: VideoFormat, channels: FrameChannels
 ) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield each frame's row number and channels (field,)."""
+    """Yield the row index and the channels (field,) of each frame."""
     from tacpipe.video.decoding import decode_frames, read_batches
 
     for row, image in decode_frames(video_format, read_batches(columns), grey=channels.grey):
@@ -306,14 +306,14 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
     for recording in recordings:
         formats = [(columns, read_format(columns)) for columns in map(recording.columns, recording.streams)]
         streams.append([(columns, video_format) for columns, video_format in formats if video_format])
-    total = sum(columns.num_rows for parts in streams for columns, _ in parts)
+    total = sum(columns.num_rows for frame_streams in streams for columns, _ in frame_streams)
     if not total:
         raise TacpipeError("The training recordings have no frames. Give the recordings of a camera.")
     step = max(1, total // count)
     images = []
-    for parts in filter(None, streams):
+    for frame_streams in filter(None, streams):
         reduced = []
-        for columns, video_format in parts:
+        for columns, video_format in frame_streams:
             frames = decode_frames(video_format, read_batches(columns))
             reduced += [reduce_image(image) for row, image in frames if row % step == 0]
         images.append(np.array(reduced, np.uint8))
@@ -321,16 +321,17 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
 
 
 def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode) -> pa.RecordBatchReader:
-    """Return the features of a stream of frames, with its clocks. The first batch determines the number of features.
+    """Return a stream of the features of frames, with their clocks. The first batch determines the number of features.
 
-    Raises `TacpipeError`, also while it is read, if the encoder returns another shape.
+    Raises `TacpipeError`, here or while the stream is read, if the encoder returns an array of the wrong shape.
     """
     from tacpipe.video.decoding import decode_frames, read_batches
 
     def features() -> Iterator[tuple[int, AnyFloats]]:
         for block in _blocks(decode_frames(video_format, read_batches(columns)), ENCODED_FRAMES):
             images = [image for _, image in block]
-            images += images[-1:] * (ENCODED_FRAMES - len(images))  # bits of a product depend on the number of rows
+            # all batches have the same size, because the rounding of a matrix product depends on its number of rows
+            images += images[-1:] * (ENCODED_FRAMES - len(images))
             encoded = encode(np.stack(images))
             if encoded.shape[:-1] != (ENCODED_FRAMES,):
                 raise TacpipeError(

@@ -46,7 +46,7 @@ class Params:
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
     tactile_rate_hz: Annotated[PositiveFloat, Unit("Hz")] = 50.0  # frame rate of each tactile sensor
     robot_rate_hz: Annotated[PositiveFloat, Unit("Hz")] = 1000.0  # rate of the arm's states
-    # fraction of tactile frames that repeat the one before; 0.75 is like the 2021 rig
+    # fraction of tactile frames that repeat the previous frame; 0.75 is like the 2021 rig
     hold_probability: Fraction = 0.07
     drop_probability: Fraction = 0.002  # fraction of samples that are lost
     # multiple of the noise and drift of real sensors (uSkin: 1.35, 1.15, 3.4 counts in x, y, z)
@@ -58,7 +58,7 @@ class Params:
     # maximum offset of the sensors' own clocks (t_device_ns)
     clock_offset_ms: Annotated[NonNegativeFloat, Unit("ms")] = 80.0
     clock_skew_ppm: Annotated[NonNegativeFloat, Unit("ppm")] = 50.0  # maximum skew of a device's own clock
-    # plans per second that the arm's controller sends, each of the next second; 0: no stream plan
+    # plans per second that the arm's controller sends, each for the next second; 0: no stream plan
     plan_rate_hz: Annotated[NonNegativeFloat, Unit("Hz")] = added(0.0)
     # what happens to the object, with friction and mass of 20 objects; replaces effort, grip loss and still.
     # jolt: moves until it slips; jolt-held: nearly slips; fade: the grip weakens until it slips; fade-held: nearly slips;
@@ -80,7 +80,7 @@ def _check_handling(params: Params | GelParams) -> None:
 
 
 def _rig_options(params: Params | MaterialParams | TouchParams | GelParams) -> dict[str, Any]:
-    """Return the params without the number of trials and the seed, which are the options of a rig."""
+    """Return the options of a rig: the params without the number of trials and the seed."""
     return {name: value for name, value in asdict(params).items() if name not in ("trials", "seed")}
 
 

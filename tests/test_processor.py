@@ -52,13 +52,13 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
 
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
     stored = provenance.describe_provenance(1.0)
-    assert provenance.unlike(stored, provenance.describe_provenance(2.0)) == []
+    assert provenance.environment_differences(stored, provenance.describe_provenance(2.0)) == []
     other_computer: Provenance = {
         **stored,
         "device": "cuda",
         "processor": {**stored["processor"], "instructions": ["sve"], "threads": 977},
     }
-    differences = provenance.unlike(other_computer, stored)
+    differences = provenance.environment_differences(other_computer, stored)
     assert [difference.partition(":")[0] for difference in differences] == ["device", "instructions", "threads"]
     assert differences[0] == f"device: cuda, now {stored['device']}"
 
@@ -74,7 +74,7 @@ def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.Mo
 
 
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
-    assert provenance.unlike({}, provenance.describe_provenance(0.0)) == []
+    assert provenance.environment_differences({}, provenance.describe_provenance(0.0)) == []
 
 
 def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(

@@ -42,7 +42,8 @@ class Clocks:
 def read_clocks(columns: Columns) -> Clocks | None:
     """Return the clocks of a stream, or None without times or with fewer than two rows.
 
-    They are read in blocks of a million rows. Without a sample counter, the median step is that of the first block.
+    They are read in blocks of a million rows. Rate and median step are those of the first block; with a sample counter, the
+    rate is that of the whole stream.
     """
     import numpy as np
     import pyarrow as pa
@@ -50,23 +51,20 @@ def read_clocks(columns: Columns) -> Clocks | None:
     names = [name for name in ("t_ns", "seq") if name in columns.column_names]
     if "t_ns" not in names or columns.num_rows < 2:
         return None
-    pieces = (piece for piece in columns.batches(names, _PIECE_ROWS) if piece.num_rows)
-    piece = next(pieces)
-    first_row, rate, median_step_ns = (
-        piece.slice(0, 1),
-        rate_hz(piece),
-        float(np.median(np.diff(piece["t_ns"].to_numpy()))),
-    )
+    blocks = (block for block in columns.batches(names, _PIECE_ROWS) if block.num_rows)
+    block = next(blocks)
+    first_row, rate = block.slice(0, 1), rate_hz(block)
+    median_step_ns = float(np.median(np.diff(block["t_ns"].to_numpy())))
     starts_ns, stops_ns = [], []
     while True:
-        t_ns, rows = piece["t_ns"].to_numpy(), gaps_before(piece, median_step_ns)
+        t_ns, rows = block["t_ns"].to_numpy(), gaps_before(block, median_step_ns)
         starts_ns.append(t_ns[rows - 1])
         stops_ns.append(t_ns[rows])
-        last_row = piece.slice(piece.num_rows - 1)
-        next_piece = next(pieces, None)
-        if next_piece is None:
+        last_row = block.slice(block.num_rows - 1)
+        next_block = next(blocks, None)
+        if next_block is None:
             break
-        piece = pa.concat_tables([last_row, next_piece])
+        block = pa.concat_tables([last_row, next_block])
     ends = pa.concat_tables([first_row, last_row])
     start_ns, stop_ns = ends["t_ns"].to_pylist()
     rate = rate_hz(ends) if "seq" in names else rate

@@ -353,11 +353,11 @@ def _describe_changes(
     count: int,
     unmatched: Sequence[str],
 ) -> str:
-    """Return one line per recording whose labels would change, those without a row, and the number of recordings."""
+    """Return a text with a line per recording whose labels would change, the recordings without a row, and a total."""
     lines = []
     for name, labels in sorted(changes.items())[:SHOWN]:
         old = current[name]
-        texts = (f"{plain(k)} {_format_value(old.get(k))} → {_format_value(value)}" for k, value in labels.items())
+        texts = [f"{plain(key)} {_format_value(old.get(key))} → {_format_value(new)}" for key, new in labels.items()]
         lines.append(f"{plain(name)}: {', '.join(texts)}")
     lines += [f"… and {len(changes) - SHOWN} more"] if len(changes) > SHOWN else []
     lines += [f"no row for {listed(unmatched)}"] if unmatched else []

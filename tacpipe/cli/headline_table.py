@@ -35,7 +35,7 @@ def method(task: object, stored: ParamValue) -> str:
 
 
 def table(headlines: Sequence[Headline]) -> TerminalTable:
-    """Return a table of headlines: for each part, the model, below it its best baseline, and other baselines."""
+    """Return a table of headlines with a group of rows per headline: the model, its best baseline, and other baselines."""
     first = headlines[0]
     heads = ["", *first.columns, first.measure, "95 % interval", "n"]
     groups = []

@@ -220,18 +220,19 @@ def _architecture(config: Values) -> ModelOrigin:
 def _describe_config(config: Values) -> ModelDescription:
     """Return the task, architecture, training data and other short entries of a configuration."""
     trained = config.get("trained_on")
+    about = {}
+    for name, entry in config.items():
+        text = _short_text(entry)
+        if name not in _APART and text is not None:
+            about[name.replace("_", " ")] = text
     return {
         **_architecture(config),
         "trained_on": {
-            # Recordings of all roles that were used for training
+            # training and validation recordings
             "recordings": len(trained) if isinstance(trained, Mapping) else None,
             "roles": {role: count for role, count in config.get("counts", {}).items() if role in _ROLES},
         },
-        "about": {
-            name.replace("_", " "): described
-            for name, entry in config.items()
-            if name not in _APART and (described := _short_text(entry)) is not None
-        },
+        "about": about,
     }
 
 
@@ -252,7 +253,7 @@ def _short_text(value: Any) -> str | None:
 
 
 def _describe_training(trained: TrainingCounts) -> list[str]:
-    """Return a line per role with its numbers of training data, and one with the number of recordings."""
+    """Return a line per role with its counts of training data, and a line with the number of recordings."""
     lines = [
         f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
         for role, counts in trained["roles"].items()
@@ -272,7 +273,7 @@ def _named_once(name: str, texts: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:
-    """Return each input's path and digest; a path only if it is in the store."""
+    """Return the datasets of each input as texts with path and digest. Paths come from the store's roots."""
     paths = {root["manifest"]: str(root["path"]) for root in store.roots.all()}
     return {
         name: [f"{paths.get(entry['manifest'], 'in no known location')} [{entry['dataset'][:12]}]" for entry in entries]
@@ -317,10 +318,10 @@ def _count_parameters(opened: Dataset) -> int | None:
 
 def _align_columns(described: list[tuple[str, Any]]) -> list[str]:
     """Return names and values in two aligned columns, with long values wrapped and values of None omitted."""
-    shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
-    width = max((len(name) for name, _ in shown), default=0) + 2
+    filled = [(name, str(value)) for name, value in described if value is not None and value != ""]
+    width = max((len(name) for name, _ in filled), default=0) + 2
     text_width = max(terminal.width_of(sys.stdout) - width, 20)
-    rows = [row for name, value in shown for row in _named_once(name, _wrap_at_commas(value, text_width))]
+    rows = [row for name, value in filled for row in _named_once(name, _wrap_at_commas(value, text_width))]
     return [f"{name:<{width}}{line}" for name, line in rows]
 
 

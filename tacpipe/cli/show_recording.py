@@ -372,15 +372,15 @@ def _gaps_text(recording: RecordingOverview, full: bool) -> str:
 
 
 def _intervals_text(label_spans: Sequence[ShownInterval], full: bool) -> str:
-    """Return one line per label of rows with its spans; "" without such labels."""
+    """Return a heading and one line per label of rows with its intervals, or "" if there are no such labels."""
     lines = []
     for label in dict.fromkeys(span.name for span in label_spans):
-        places = [
+        interval_texts = [
             f"{span.text if span.text != label else ''} {span.start_s:.3f} to {span.stop_s:.3f} s".strip()
             for span in label_spans
             if span.name == label
         ]
-        lines.append(f"{label}: {_list_first(places, full)}")
+        lines.append(f"{label}: {_list_first(interval_texts, full)}")
     return "\n".join(["labels of rows", *(f"  {shown(line)}" for line in lines)]) if lines else ""
 
 

@@ -89,17 +89,18 @@ class Autoencoder:
     def from_files(cls, files: Mapping[str, bytes]) -> Autoencoder:
         """Return the codec that `to_files` stored."""
         content, tensors = json.loads(files[codec.DESCRIPTION]), model_files.arrays(files[codec.TENSORS], codec.TENSORS)
-        encoder, decoder = (
-            tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(content["layers"][part]))
-            for part in ("encoder", "decoder")
-        )
+
+        def layers(part: str) -> Layers:
+            indices = range(content["layers"][part])
+            return tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in indices)
+
         return cls(
             tuple(content["channels"]),
             tuple(content["layout"]),
             tensors["mean_count"],
             tensors["scale_count"],
-            encoder,
-            decoder,
+            layers("encoder"),
+            layers("decoder"),
             content["frames"],
             content["of"],
             measures.measures_from(content),

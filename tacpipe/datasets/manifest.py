@@ -184,7 +184,7 @@ class Manifest:
         return Item(self.recordings[name], self.labels.get(name), self.sources.get(name))
 
     def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
-        """Return the manifest with hand-set attributes; labels of missing recordings are dropped."""
+        """Return the manifest with labels set by hand; labels of recordings that it does not contain are dropped."""
         items = {}
         for name, values in sorted(labels.items()):
             if name not in self.recordings:

@@ -259,7 +259,7 @@ class Pages:
         divided: list[Page] = []
         fresh: dict[str, bytes] = {}
 
-        def add(group: dict[str, Item]) -> None:
+        def add_page(group: dict[str, Item]) -> None:
             content = PageContent.from_items(group)
             stored = content.to_bytes()
             page = content.describe(stored)
@@ -269,11 +269,11 @@ class Pages:
         group: dict[str, Item] = {}
         for name, item in items:
             if group and begins(name):
-                add(group)
+                add_page(group)
                 group = {}
             group[name] = item
         if group:
-            add(group)
+            add_page(group)
         return cls(divided, read, fresh)
 
     @classmethod

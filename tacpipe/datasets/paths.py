@@ -73,7 +73,7 @@ _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz01234567
 
 
 def valid_name(text: str) -> str:
-    r"""Convert text to a name of a recording, in Unicode's form NFC; empty if it has no valid characters.
+    r"""Return ``text`` as a valid name of a recording, in Unicode's form NFC, or "" if it has no valid characters.
 
     Valid are ASCII letters, digits, dots, dashes and underscores, and all other printable characters. Invalid
     characters become a dash. A name of more than 192 bytes is truncated and ends with a part of its digest.
@@ -86,8 +86,8 @@ def valid_name(text: str) -> str:
     name = "-".join(printable_text.split()).strip("-.")
     if len(name.encode()) <= MAX_NAME_BYTES:
         return name
-    cut = name.encode()[: MAX_NAME_BYTES - _MARK - 1].decode(errors="ignore")
-    return f"{cut}-{bytes_digest(name.encode())[:_MARK]}"
+    prefix = name.encode()[: MAX_NAME_BYTES - _MARK - 1].decode(errors="ignore")
+    return f"{prefix}-{bytes_digest(name.encode())[:_MARK]}"
 
 
 def folded_name(name: str) -> str:

@@ -191,20 +191,20 @@ def _order(
 ) -> list[str]:
     """Return the names in an order in which every prefix has the same fraction of each stratum, to within one recording.
 
-    Recordings are shuffled in their stratum and placed at (rank + 1/2) / size.
+    Recordings are shuffled within their stratum, and sorted by (rank + 1/2) / size of the stratum.
     """
-    places: dict[str, float] = {}
+    positions: dict[str, float] = {}
     for stratum in _strata(names, attributes, scheme).values():
         shuffled = rng.permutation(len(stratum))
-        places |= {stratum[i]: (rank + 0.5) / len(stratum) for rank, i in enumerate(shuffled)}
+        positions |= {stratum[i]: (rank + 0.5) / len(stratum) for rank, i in enumerate(shuffled)}
     ties = dict(zip(names, rng.random(len(names)), strict=True))
-    return sorted(names, key=lambda name: (places[name], ties[name]))
+    return sorted(names, key=lambda name: (positions[name], ties[name]))
 
 
 def _limit_training(
     roles: Roles, older_roles: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> Roles:
-    """Return the role ``unused`` for training recordings beyond ``few``; those of an older split are kept.
+    """Return the role ``unused`` for training recordings beyond ``few``. Roles of an older split do not change.
 
     Raises `TacpipeError` if no recording has the value of ``few_of``.
     """
@@ -219,10 +219,10 @@ def _limit_training(
     for fold in sorted({fold for _, fold in roles}):
         for group in _sort_naturally(set(groups)):
             trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
-            fresh = [name for name in trained if (name, fold) not in older_roles]
-            left_count = max(scheme.few - (len(trained) - len(fresh)), 0)
-            order = _order(fresh, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
-            unused |= {(name, fold): UNUSED for name in order[left_count:]}
+            new_names = [name for name in trained if (name, fold) not in older_roles]
+            used_count = max(scheme.few - (len(trained) - len(new_names)), 0)
+            order = _order(new_names, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
+            unused |= {(name, fold): UNUSED for name in order[used_count:]}
     return unused
 
 
@@ -378,18 +378,22 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
 def _leave_one_out(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
-    """Return one fold per value of ``by``, sorted; values that an older split tested keep their fold.
+    """Return one fold per value of ``by``, in sorted order; values that an older split tested keep their fold.
 
     Raises `TacpipeError` if there is only one value.
     """
     values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
-    old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
-    left_out = [old[fold] for fold in sorted(old)]
-    left_out += [value for value in _sort_naturally(set(values.values())) if value not in left_out]
-    if len(left_out) < 2:
-        raise TacpipeError(f"All recordings have {scheme.by} {left_out[0]}; leaving it out leaves none to train on.")
+    older_values = {
+        fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values
+    }
+    tested_values = [older_values[fold] for fold in sorted(older_values)]
+    tested_values += [value for value in _sort_naturally(set(values.values())) if value not in tested_values]
+    if len(tested_values) < 2:
+        raise TacpipeError(
+            f"All recordings have {scheme.by} {tested_values[0]}; leaving it out leaves none to train on."
+        )
     folds = []
-    for fold, value in enumerate(left_out):
+    for fold, value in enumerate(tested_values):
         roles = _draw_validation([name for name in values if values[name] != value], attributes, scheme, fold + 1)
         folds.append(roles | {name: "test" for name in values if values[name] == value})
     return folds
@@ -412,7 +416,7 @@ def _older_roles(
 def _strata(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> dict[tuple[str, ...], list[str]]:
-    """Return the recordings for each combination of values of the attributes ``stratify``, sorted."""
+    """Return the recordings by combination of values of the attributes ``stratify``, sorted by these values."""
     stratified = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
     strata: dict[tuple[str, ...], list[str]] = {}
     for name in sorted(names):

@@ -284,16 +284,12 @@ class ByRecording:
 def _with_input_attributes(
     results: Mapping[str, RecordingEntry], entries: Mapping[str, RecordingEntry]
 ) -> dict[str, RecordingEntry]:
-    """Return results ordered by name. If ``entries`` has the recording, its attributes precede those of the result."""
-    return {
-        name: {
-            "attributes": {**entries[name]["attributes"], **entry["attributes"]}
-            if name in entries
-            else entry["attributes"],
-            "shards": entry["shards"],
-        }
-        for name, entry in sorted(results.items())
-    }
+    """Return results sorted by name. Attributes of the input ``entries`` precede those of the result."""
+    with_attributes: dict[str, RecordingEntry] = {}
+    for name, entry in sorted(results.items()):
+        inherited = entries[name]["attributes"] if name in entries else {}
+        with_attributes[name] = {"attributes": {**inherited, **entry["attributes"]}, "shards": entry["shards"]}
+    return with_attributes
 
 
 def error(exit_code: int, sentence: str) -> TacpipeError:

@@ -239,7 +239,7 @@ def _remake(store: Store, name: str, path: str, problem: str, size: int | None =
             _remaking.discard(key)
         if store.has(name, size):
             return store.read(name, size)
-        differences = "; ".join(provenance.unlike(made_by, provenance.describe_provenance(0.0)))
+        differences = "; ".join(provenance.environment_differences(made_by, provenance.describe_provenance(0.0)))
         obstacle = (
             f"{identity['stage']} gave something else when it was run again ({differences or 'it depends on chance'})"
         )

@@ -75,7 +75,9 @@ class Outcome:
         """Compare two records of a result, and add the differences. ``name`` is the stage or the recording."""
         differs = execution.differences(stored["result"], recomputed["result"], name)
         self.differs += differs
-        environment_differences = provenance.unlike(stored["provenance"], recomputed["provenance"]) if differs else []
+        environment_differences = (
+            provenance.environment_differences(stored["provenance"], recomputed["provenance"]) if differs else []
+        )
         self.unlike += [difference for difference in environment_differences if difference not in self.unlike]
 
     def of_results(self) -> Summary:

@@ -170,23 +170,25 @@ def worker(name: str) -> Iterator[None]:
         _worker.reset(token)
 
 
-def unlike(stored: Environment, now: Environment) -> list[str]:
-    """Return the differences between two computers that affect rounding; empty if ``stored`` does not record them.
+def environment_differences(stored: Environment, now: Environment) -> list[str]:
+    """Return sentences on the differences between two computers that affect rounding.
 
-    >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
+    Differences that ``stored`` does not record are left out.
+
+    >>> environment_differences({"processor": {"threads": 1}}, {"processor": {"threads": 2}})
     ['threads: 1, now 2']
     """
     differences = []
     for name in ("device", "processor", "libraries"):
         stored_value, current_value = stored.get(name), now.get(name)
         if isinstance(stored_value, Mapping) and isinstance(current_value, Mapping):
-            parts = [
-                (part, stored_value.get(part), current_value.get(part))
-                for part in sorted({*stored_value, *current_value})
+            compared = [
+                (quantity, stored_value.get(quantity), current_value.get(quantity))
+                for quantity in sorted({*stored_value, *current_value})
             ]
         else:
-            parts = [(name, stored_value, current_value)] if stored_value and current_value else []
-        differences += [f"{part}: {_text(old)}, now {_text(new)}" for part, old, new in parts if old != new]
+            compared = [(name, stored_value, current_value)] if stored_value and current_value else []
+        differences += [f"{quantity}: {_text(old)}, now {_text(new)}" for quantity, old, new in compared if old != new]
     return differences
 
 

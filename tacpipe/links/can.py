@@ -101,7 +101,7 @@ def _make_size_invalid(line: bytes) -> bytes:
 
 
 def parse_bus(target: str) -> tuple[str, str, int | None]:
-    """Return kind, channel and bit rate of an address. The bit rate is None if the address has none.
+    """Return the kind, channel and bit rate of a CAN bus from its address. The bit rate is None if the address has none.
 
     Raises `UsageError` for an invalid address.
 

@@ -116,9 +116,10 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | No
 
 
 def _rank(finding: Finding) -> tuple[float, bool, float, float, int]:
-    """Return the sort key of a finding: rounded evidence, because one incomplete frame is not significant, then rate.
+    """Return the sort key of a finding, best first: evidence, explained bytes, then how well the rate fits.
 
-    Products come before boards that are described by the bytes themselves.
+    Values are rounded, because one incomplete frame is not significant. Products come before boards whose bytes describe
+    themselves.
     """
     expected_hz = finding.candidate.sensor.rate_hz
     rate_ratio = abs(np.log(finding.rate_hz / expected_hz)) if finding.rate_hz > 0 and expected_hz > 0 else np.inf

@@ -93,9 +93,10 @@ class Settings:
         places = {name: source for name in used_settings if name not in given_options}
         values = {**used_settings, **given_options}
         task = params.build_dataclass(
-            task_settings, {n: v for n, v in values.items() if n in task_fields}, source, "key"
+            task_settings, {name: value for name, value in values.items() if name in task_fields}, source, "key"
         )
-        base = params.build_dataclass(cls, {n: v for n, v in values.items() if n in common}, source, "key")
+        common_values = {name: value for name, value in values.items() if name in common}
+        base = params.build_dataclass(cls, common_values, source, "key")
         settings: Self = replace(base, task=task, places=places)
         task.check(settings)
         return settings

@@ -92,7 +92,7 @@ def copy(
 ) -> None:
     """Copy objects, then manifests, then records, so that references always follow their targets.
 
-    ``before`` is a manifest in the target with much in common, such as the last one of that name.
+    ``before`` is the digest of a similar manifest in the target, such as the previous one of the same name.
     """
     plan = _plan_copy(source, target, dataset, ancestors=ancestors)
     sizes = plan.sizes()
@@ -121,7 +121,7 @@ def copy(
 
 
 def _find_damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
-    """Return the objects whose content does not match their digest; an empty list unless ``verify`` is set."""
+    """Return those of the objects ``names`` whose content does not match their digest; none unless ``verify`` is set."""
 
     def is_sound(name: str) -> bool:
         try:

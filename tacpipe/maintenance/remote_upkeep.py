@@ -116,9 +116,9 @@ def _named_by_roots(store: RemoteStore) -> set[str]:
 def collect(
     store: RemoteStore, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS
 ) -> Collected:
-    """Remove unneeded content, records before their objects; with ``dry_run``, only count it.
+    """Remove unneeded records and then their objects, or with ``dry_run`` only count them.
 
-    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because the content that it named is then
+    Raises `DamagedError` if a root or the manifest of an ancestor is damaged, because the objects that it needs are then
     unknown.
     """
     collected = Collected()
@@ -222,7 +222,7 @@ def _forget_dead(store: RemoteStore, grace_days: float) -> float:
 
 
 def _collect_needed(store: RemoteStore) -> _Needed:
-    """Return what announcements and roots need.
+    """Return the manifests and objects that announced runs and roots need.
 
     Announcements are read first: a run that ends in between has already written its root. Raises `DamagedError` if a
     root or a needed manifest is damaged.
@@ -271,9 +271,10 @@ def _manifest(store: RemoteStore, name: str) -> Manifest | None:
 
 
 def _find_unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Manifest]) -> set[str]:
-    """Return the digests of manifests that have no root but contain the only copy of recordings or labels.
+    """Return the digests of manifests without a root that contain the only copy of recordings or labels.
 
-    The digests of everything in these manifests are included.
+    ``recorded`` are the manifests of recordings that have a root. The digests of everything in the returned manifests are
+    included.
     """
     covered = {possession for manifest in recorded for possession, _ in replacing.possessions(manifest)}
     retained: set[str] = set()

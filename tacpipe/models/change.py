@@ -325,16 +325,16 @@ def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
     axes = list(dict.fromkeys(channel.get("axis", "") for channel in layout))
     taxels = len(layout) // max(len(streams) * len(axes), 1)
     positions = [(channel.get("stream", ""), channel.get("taxel"), channel.get("axis", "")) for channel in layout]
-    names = list(dict.fromkeys(taxel for _, taxel, _ in positions))
-    expected = list(itertools.product(streams, names, axes))
-    if None in names or positions != expected or taxels < 2:
+    taxel_names = list(dict.fromkeys(taxel for _, taxel, _ in positions))
+    expected = list(itertools.product(streams, taxel_names, axes))
+    if None in taxel_names or positions != expected or taxels < 2:
         reason = f"these {len(layout)} channels are not" if layout else "the recordings contain latents"
         declared = (
             "Write {taxel}, and {axis} if there are several, in match of [streams.…] columns of the layout file. "
         )
         raise TacpipeError(
             f"The taxelwise model reads raw channels, sensor by sensor and taxel by taxel, and sensors of equal size; "
-            f"{reason}. {declared if layout and None in names else ''}"
+            f"{reason}. {declared if layout and None in taxel_names else ''}"
             f"Train it on segments without a codec, or choose --architecture gru, lstm, tcn or recurrent."
         )
     return len(streams), taxels, len(axes)

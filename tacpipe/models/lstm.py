@@ -86,10 +86,7 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
 
 
 def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
-    """Return the result of `lstm`, computed by torch's layer.
-
-    It is cuDNN's on a GPU, and the fastest on a CPU without gradients.
-    """
+    """Return the result of `lstm`, computed by torch's layer: by cuDNN on a GPU, and fastest on a CPU without gradients."""
     from_input, from_state, bias = weights
     all_inputs = inputs
     if lead is not None:  # zero after the first step

@@ -118,8 +118,8 @@ def _convert_setting(stage: AnyStage, kind: Kind, setting: _Setting, before: Val
             rule = f"with {name} {current} it must be {fields_of.describe(annotation)}"
             raise UsageError(f"{subject} is {fields_of.format_value(setting.value)}; {rule}.")
         value = fields_of.check(setting.value, annotation, setting.name, setting.place)
-        files = [mark for mark in fields_of.metadata(annotation) if isinstance(mark, TomlFile)]
-        return files[0].read(value) if files else value
+        toml_files = [constraint for constraint in fields_of.metadata(annotation) if isinstance(constraint, TomlFile)]
+        return toml_files[0].read(value) if toml_files else value
     owners = params_of.choices_with(stage, setting.key)
     raise UsageError(
         f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "

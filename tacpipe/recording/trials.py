@@ -199,7 +199,7 @@ def _record_trial(
 
 
 def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
-    """Seal a spool, append it to the dataset ``output``, and remove it or move it to the retained spools."""
+    """Seal a spool, append it to the dataset ``output``, and remove the spool or move it to the retained spools."""
     sealed = sealing.seal(spooled, rig)
     with store.at_work():
         name = appending.append(store, output, spooled, rig, sealed)

@@ -50,14 +50,14 @@ def metrics_sentence(results: Sequence[Dataset]) -> str:
     return "These results contain no errors by recording, so methods cannot be compared. Their numbers are below."
 
 
-def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
-    """Return the fold of one result, the ``place``-th of ``count``: its headlines, metrics and provenance."""
+def metric_folds(result: Dataset, number: int, count: int) -> list[Fold]:
+    """Return the fold of result ``number`` of ``count``: its headlines, metrics and provenance."""
     config = context.read_json(result, "config.json")
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
     headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
     first = [table("Model and best baseline", *headline.table(headlines))] if headlines else []
-    title = f"{f'{place}. ' if count > 1 else ''}{name.replace('_', ' ')}"
+    title = f"{f'{number}. ' if count > 1 else ''}{name.replace('_', ' ')}"
     return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
 
 

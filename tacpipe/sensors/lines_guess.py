@@ -277,9 +277,9 @@ def _columns(
         else:
             taxels += 1
             unit = {} if kind == "f32" else {"unit": "count"}
-            last = options[-1] if options else {}
-            if last.get("type") == kind and last.get("name", "").startswith("taxel{"):
-                last["name"] = re.sub(r"\.\.\d+", f"..{taxels}", last["name"])
+            previous = options[-1] if options else {}
+            if previous.get("type") == kind and previous.get("name", "").startswith("taxel{"):
+                previous["name"] = re.sub(r"\.\.\d+", f"..{taxels}", previous["name"])
             else:
                 options.append({"name": f"taxel{{{taxels}..{taxels}}}", "type": kind, **unit})
     return options

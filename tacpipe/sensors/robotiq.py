@@ -144,16 +144,16 @@ class Robotiq(Sensor):
     def encode(self, samples: Samples) -> Bytes:
         """Return the packets of these samples, with the fields in the order of the protocol for each finger."""
         blocks = {key: block for keys, block in zip(self._groups.values(), samples.values, strict=True) for key in keys}
-        used = dict.fromkeys(self._groups, 0)
-        pieces: list[Bytes] = []
+        used = dict.fromkeys(self._groups, 0)  # number of encoded columns of each block
+        fields: list[Bytes] = []
         for code, finger in self._keys:
             _, name, count = KINDS[PARTS[code]]
             kind, block = np.dtype(name), blocks[code, finger]
             numbers = block[:, used[kind] : used[kind] + count].astype(kind)
             used[kind] += count
-            pieces.append(np.full((len(samples), 1), code | finger << 2, dtype=np.uint8))
-            pieces.append(np.ascontiguousarray(numbers).view(np.uint8))
-        body = np.hstack(pieces)
+            fields.append(np.full((len(samples), 1), code | finger << 2, dtype=np.uint8))
+            fields.append(np.ascontiguousarray(numbers).view(np.uint8))
+        body = np.hstack(fields)
         head = np.frombuffer(bytes([START, 0, SYNCHRONOUS, body.shape[1]]), np.uint8)
         return np.hstack([np.broadcast_to(head, (len(body), HEADER)), body])
 

@@ -174,7 +174,7 @@ IIWA14 = (
 def joint_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
     """Return the poses of the joints' frames in the base frame (time, joint, 4, 4) at angles ``joint_rad`` (time, joint)."""
     frames = np.empty((*joint_rad.shape, 4, 4))
-    reached = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
+    frame = np.broadcast_to(np.eye(4), (len(joint_rad), 4, 4))
     for joint, (length, offset, twist) in enumerate(zip(chain.length_m, chain.offset_m, chain.twist_rad, strict=True)):
         cos, sin = np.cos(joint_rad[:, joint]), np.sin(joint_rad[:, joint])
         tilt_cos, tilt_sin = np.cos(twist), np.sin(twist)
@@ -193,8 +193,8 @@ def joint_frames(chain: KinematicChain, joint_rad: AnyFloats) -> AnyFloats:
             offset * tilt_cos,
         )
         step[:, 3, 3] = 1.0
-        reached = reached @ step
-        frames[:, joint] = reached
+        frame = frame @ step
+        frames[:, joint] = frame
     return frames
 
 

@@ -217,7 +217,7 @@ def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
 
 
 def _neighbours(t_ns: Times, grid_ns: Times) -> tuple[Indices, Indices, Floats]:
-    """Return the rows before and after each grid point and the weight of the latter, each (grid,).
+    """Return the row before each grid point, the row after it, and the weight of the row after it, each (grid,).
 
     At a sample, both rows are that sample, so that the next sample has no effect. Raises `TacpipeError` without
     samples.

@@ -56,12 +56,13 @@ def locate(*datasets: Path) -> Store:
 def project(*datasets: Path) -> Path:
     """Return the folder whose ``.tacpipe`` is the store for ``datasets``, which need not exist.
 
-    It is in the project of the first dataset that has one, or else in that of the working directory. Inside the project
-    the nearest store upwards is used, or a new one in the project's folder. A store outside the project is used only if
-    it already contains one of the datasets.
+    The folder is in the project of the first dataset that has one, or else in the project of the working directory. Within
+    the project the nearest store upwards is used, or a new store in the project's folder. A store outside the project is
+    used only if it already contains one of the datasets.
     """
     paths = [Path(os.path.abspath(path)) for path in datasets]  # noqa: PTH100  (a name holds no "..", and links stay)
-    start, top = next(((path, top) for path in paths if (top := project_folder(path)) is not None), (None, None))
+    start = next((path for path in paths if project_folder(path) is not None), None)
+    top = None if start is None else project_folder(start)
     if start is None or top is None:
         folder = _holder({folder: None for path in paths for folder in path.parents}, paths)
         if folder is not None:

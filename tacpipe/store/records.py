@@ -237,7 +237,7 @@ def digests(result: StoredResult) -> Iterator[str]:
 
 
 def find_naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
-    """Yield the records whose text contains the digest ``name``, those written closest to ``written_s`` (Unix time) first.
+    """Yield the records that contain the digest ``name``, starting with those written closest to ``written_s`` (Unix time).
 
     A record is written just before its result is published, so few records are read.
     """

@@ -68,8 +68,8 @@ class RemoteRoots:
         next output replaces it, unless it is ``lasting``. Returns False without a change if another push came first.
         """
         is_snapshot = before is not None and not before.get("output")  # whether ``before`` is a snapshot
-        same = before is not None and before["manifest"] == manifest and before.get("project") == project
-        if same and (output or is_snapshot):
+        is_same = before is not None and before["manifest"] == manifest and before.get("project") == project
+        if is_same and (output or is_snapshot):
             return True
         root = next_root(before, name, PUSHED, manifest, lasting=lasting)
         root["project"] = project

@@ -53,11 +53,11 @@ class Grid:
         gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
-        """Prepare a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``, by whose columns it reads.
+        """Prepare a grid of the ``kind`` uniform, logged or fresh, whose points follow the stream ``master``.
 
-        ``gap_ns`` is the age of the newest sample above which a stream is in a gap. ``rate_hz`` is the rate of a
-        uniform grid, None for others. ``origin_ns`` is the first point of an earlier uniform grid to continue; by
-        default, a grid starts at the master's first sample.
+        ``streams`` are the columns that are read from each stream. A stream is in a gap if its newest sample is older than
+        ``gap_ns``. ``rate_hz`` is the rate of a uniform grid, None for others. ``origin_ns`` is the first point of an
+        earlier uniform grid to continue; by default, a grid starts at the master's first sample.
         """
         self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}

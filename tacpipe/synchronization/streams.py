@@ -363,7 +363,7 @@ def grid(
     """Return the grid points (grid,) in ns within all streams, and their rows in the master or in the uniform grid.
 
     A uniform grid starts at the master's first sample. With ``hold_values`` the grid ends with the last stream, because
-    online the last sample of a stream is unknown, and equal times become one point. The results are kept in ``storage``.
+    online the last sample of a stream is unknown, and equal times become one point. The results are stored in ``storage``.
     Raises `TacpipeError` if there are no points.
     """
     import numpy as np
@@ -383,15 +383,16 @@ def grid(
             block_ns = origin_ns + uniform_offsets(first, stop - first, rate_hz)
         else:
             block_ns = master.t_ns[first:stop]
-        selected = (block_ns >= first_ns) & (block_ns <= last_ns)
+        is_point = (block_ns >= first_ns) & (block_ns <= last_ns)
         if kind == "fresh":
-            selected &= ~master.repeated[first:stop]
+            is_point &= ~master.repeated[first:stop]
         if hold_values and rate_hz is None:
             steps_ns = np.diff(master.t_ns[first : stop + 1])
-            selected[: len(steps_ns)] &= steps_ns > 0
-        chosen = np.flatnonzero(selected)
-        grid_ns[points : points + len(chosen)], rows[points : points + len(chosen)] = block_ns[chosen], first + chosen
-        points += len(chosen)
+            is_point[: len(steps_ns)] &= steps_ns > 0
+        selected = np.flatnonzero(is_point)
+        grid_ns[points : points + len(selected)] = block_ns[selected]
+        rows[points : points + len(selected)] = first + selected
+        points += len(selected)
         storage.read(4 * block_ns.nbytes)
     if not points:
         latest = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))

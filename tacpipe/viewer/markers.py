@@ -50,7 +50,7 @@ def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequenc
     frames = video.columns(stream)
     if read_format(frames) is None or not frames.num_rows:
         return None
-    rows, columns = (max(place[axis] for place in names_by_position) for axis in (0, 1))
+    rows, columns = (max(position[axis] for position in names_by_position) for axis in (0, 1))
     grid = find_grid(read_frames(frames, [0], grey=True)[0], rows, columns)
     if grid is None:
         return None

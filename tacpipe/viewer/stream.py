@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
 TIMELINE = "time"
+# first parts of entity paths
 TOUCH, FORECAST, ERROR, SERIES, TRUTH, CHANNELS = "touch", "forecast", "error", "series", "truth", "channels"
 MAPS, SPANS, SPACE, CAMERAS, CARPET, ABOUT, EVENTS = "taxels", "spans", "space", "cameras", "carpet", "about", "events"
 NAMED = "named"
@@ -33,9 +34,9 @@ FRAMES_HZ = 60.0  # maximum rate of maps and paths: that of a display
 MAX_ROWS = 30_000  # maximum points per line; a viewer cannot draw millions, so longer lines are drawn as their envelope
 POINTS = 4000  # points of a path drawn as a line
 BINS, HEIGHT = 1200, 330  # bins and height of the carpet, in pixels
-BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes of the chart of scores, in rows
+BARS_WIDTH, NAMES_WIDTH, NAMES_RISE = 8.0, 6.0, 0.55  # sizes in the chart of scores, in heights of a row
 BAR = "#5a6572"
-ARROW_GAIN = 3.0  # drawn length of a marker's arrow, in displacements
+ARROW_GAIN = 3.0  # ratio of the drawn length of a marker's arrow to the displacement
 EVENT_WIDTH = 1 / 200  # drawn length of an event, as a fraction of the recording
 RAMP = 24  # steps of a colour scale
 
@@ -102,10 +103,11 @@ class RerunStream:
         names_and_colours = [(name, drawing.indexed_colour(index, colours)) for index, name in enumerate(curves.names)]
         self._write_lines(parts, curves.t_ns, curves.values, names_and_colours)
 
-    def _write_touch(self, finger: Taxels, place: int) -> None:
+    def _write_touch(self, finger: Taxels, index: int) -> None:
+        """Write the load of a finger as a line in the colour of ``index``."""
         if len(finger.t_ns) > 1:
             self._write_lines(
-                (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.indexed_colour(place))]
+                (TOUCH, finger.name), finger.t_ns, finger.load[:, None], [(finger.name, drawing.indexed_colour(index))]
             )
 
     def _write_channels(self, finger: Taxels) -> None:
@@ -118,7 +120,7 @@ class RerunStream:
             self._write_lines(parts, finger.t_ns, finger.change[:, :, axis], names_and_colours)
 
     def _write_maps(self, group: str, fingers: Sequence[Taxels]) -> None:
-        """Write the maps of a group of fingers, see `group_by_scale`, which share a scale of colours and arrows."""
+        """Write the maps of a group of fingers, which share a scale of colours and arrows; see `group_by_scale`."""
         low, high = taxels.scale(np.concatenate([finger.magnitude.ravel() for finger in fingers]))
         shear = np.concatenate([np.linalg.norm(finger.change[:, :, :2], axis=2).ravel() for finger in fingers])
         longest = max(float(np.nanquantile(shear, taxels.SCALE_QUANTILE)), taxels.MIN_SCALE) if group == "3" else 1.0
@@ -171,13 +173,13 @@ class RerunStream:
             colors=drawing.map_colours(np.linspace(low, high, RAMP), low, high),
             radii=0.1 * pitch,
         )
-        ends = [f"{low:,.4g}", f"{high:,.4g} {unit}".strip()]
-        text = _labels([(left + 0.2 * pitch, bottom + 0.4 * pitch), (right - 0.6 * pitch, bottom + 0.4 * pitch)], ends)
+        texts = [f"{low:,.4g}", f"{high:,.4g} {unit}".strip()]
+        ends = [(left + 0.2 * pitch, bottom + 0.4 * pitch), (right - 0.6 * pitch, bottom + 0.4 * pitch)]
         self._log_static((*parts, "ramp"), boxes)
-        self._log_static((*parts, "ends"), text)
+        self._log_static((*parts, "ends"), _labels(ends, texts))
 
     def _write_forecasts(self, forecasts: Sequence[DrawnForecast]) -> None:
-        """Write measured and predicted load of each finger, the errors, and the maps of the last step and of its errors."""
+        """Write the measured and predicted load of each finger, the errors, and maps of the last step and of its errors."""
         for name in dict.fromkeys(member.measured.name for member in forecasts):
             steps = [member for member in forecasts if member.measured.name == name]
             last = steps[-1]
@@ -211,25 +213,25 @@ class RerunStream:
         if not fingers:
             return
         start_ns, stop_ns = contents.ends_ns
-        parts, labels, top = [], [], 0
+        strips, labels, top = [], [], 0
         rows = carpet_size(contents)[1] // (sum(len(finger.names) for finger in fingers) + len(fingers) - 1)
         for finger in fingers:
             low, high = taxels.scale(finger.magnitude)
             values = taxels.bin_peaks(finger.t_ns, finger.magnitude, start_ns, stop_ns, BINS)
-            parts.append(taxels.image(drawing.map_colours(values, low, high), rows))
-            labels.append((finger.name, top + parts[-1].shape[0] / 2))
-            top += parts[-1].shape[0] + rows
-            parts.append(np.zeros((rows, BINS, 3), np.uint8))
-        picture = np.concatenate(parts[:-1])
+            strip = taxels.image(drawing.map_colours(values, low, high), rows)
+            labels.append((finger.name, top + strip.shape[0] / 2))
+            top += strip.shape[0] + rows
+            strips += [strip, np.zeros((rows, BINS, 3), np.uint8)]
+        picture = np.concatenate(strips[:-1])
         self._log_static((CARPET, "image"), rr.Image(picture))
         names = _labels([(BINS / 2, y) for _, y in labels], [name for name, _ in labels])
         self._log_static((CARPET, "names"), names)
         cursor_ns = start_ns + np.linspace(0, stop_ns - start_ns, BINS).astype(np.int64)
-        strips = np.zeros((BINS, 2, 2), np.float32)
-        strips[:, :, 0] = np.arange(BINS)[:, None]
-        strips[:, 1, 1] = picture.shape[0]
+        lines = np.zeros((BINS, 2, 2), np.float32)  # (bin, start and end, xy)
+        lines[:, :, 0] = np.arange(BINS)[:, None]
+        lines[:, 1, 1] = picture.shape[0]
         self._log_static((CARPET, "cursor"), rr.LineStrips2D.from_fields(colors=[(255, 255, 255)], radii=1.0))
-        self._send_columns((CARPET, "cursor"), cursor_ns, rr.LineStrips2D.columns(strips=list(strips)))
+        self._send_columns((CARPET, "cursor"), cursor_ns, rr.LineStrips2D.columns(strips=list(lines)))
 
     def _write_spans(self, contents: DrawnContents) -> None:
         """Write contacts, labels, gaps and events as lanes of spans, and the texts of events."""
@@ -368,17 +370,17 @@ def carpet_size(contents: DrawnContents) -> tuple[int, int]:
 
 
 def group_by_scale(fingers: Sequence[Taxels]) -> dict[str, list[Taxels]]:
-    """Return fingers with the same unit and number of axes, which share a scale, by the number of axes.
+    """Return groups of fingers with the same unit and number of axes, which share a scale.
 
-    A second unit with the same number of axes has the key "axes unit".
+    The key of a group is its number of axes; for a second unit with the same number of axes, it is "axes unit".
     """
-    shared: dict[tuple[int, str], list[Taxels]] = {}
+    by_axes_and_unit: dict[tuple[int, str], list[Taxels]] = {}
     for member in fingers:
-        shared.setdefault((member.change.shape[2], member.unit), []).append(member)
-    names: dict[str, list[Taxels]] = {}
-    for (axes, _), members in shared.items():
-        names[str(axes) if str(axes) not in names else f"{axes} {members[0].unit}"] = members
-    return names
+        by_axes_and_unit.setdefault((member.change.shape[2], member.unit), []).append(member)
+    groups: dict[str, list[Taxels]] = {}
+    for (axes, _), members in by_axes_and_unit.items():
+        groups[str(axes) if str(axes) not in groups else f"{axes} {members[0].unit}"] = members
+    return groups
 
 
 def channels_title(finger: Taxels, axis: str) -> str:
@@ -406,11 +408,11 @@ def state_changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
     return np.array(times_ns, np.int64), [states[t_ns] for t_ns in times_ns]
 
 
-def spacing(places: Floats) -> float:
+def spacing(positions: Floats) -> float:
     """Return the median distance of positions (taxel, 2) to their nearest neighbour; 1 for a single position."""
-    if len(places) < 2:
+    if len(positions) < 2:
         return 1.0
-    distances = np.linalg.norm(places[:, None] - places, axis=2)
+    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
     np.fill_diagonal(distances, np.inf)
     return float(np.median(distances.min(axis=1))) or 1.0
 
@@ -440,9 +442,10 @@ def _shades(colour: str, count: int) -> list[tuple[int, int, int]]:
     return [dark if index % 2 else bright for index in range(count)]
 
 
-def _labels(places: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:
+def _labels(positions: Sequence[tuple[float, float]], texts: Sequence[str]) -> Any:
     """Return texts at positions of a two-dimensional view."""
-    return _rerun().Points2D(places, labels=texts, show_labels=True, radii=0.01, colors=[drawing.rgb(drawing.MEASURED)])
+    colours = [drawing.rgb(drawing.MEASURED)]
+    return _rerun().Points2D(positions, labels=texts, show_labels=True, radii=0.01, colors=colours)
 
 
 def _rerun() -> Any:

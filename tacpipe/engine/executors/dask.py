@@ -57,10 +57,10 @@ def local_versions(stage: str) -> dict[str, str]:
     }
 
 
-def unlike(local: Mapping[str, str], worker: Mapping[str, str]) -> list[str]:
+def version_differences(local: Mapping[str, str], worker: Mapping[str, str]) -> list[str]:
     """Return phrases about the differences between a ``worker`` and this process.
 
-    >>> unlike({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
+    >>> version_differences({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
     ['numpy 1.26 (here 2.1)', 'no torch (here 2.13)']
     """
     return [
@@ -357,7 +357,7 @@ def _work(
 
 def _check(name: str, versions: Mapping[str, str], task: WorkerTask) -> None:
     """Raise an error if this worker would compute other results, or does not reach the store of the client."""
-    differences = unlike(versions, local_versions(task.name))
+    differences = version_differences(versions, local_versions(task.name))
     if differences:
         raise UsageError(
             f"Worker {name} would compute other results than this computer: {'; '.join(differences)}. Install the "

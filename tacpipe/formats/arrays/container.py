@@ -229,7 +229,7 @@ def _rows_table(tree: Tree, episode: Episode, part: StreamArrays, start: int, st
 
 
 def _read_attributes(tree: Tree, episode: Episode) -> tuple[dict[str, Attribute], dict[str, str]]:
-    """Return the attributes of a recording's group and its parents, and why texts were left out, by attribute.
+    """Return the attributes of a recording's group and its parents, and for attributes that were left out, the reason.
 
     A JSON object in a text becomes one attribute per value. Texts that are too long for an attribute are left out.
     """

@@ -319,7 +319,7 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _parse_array(path: str, metadata: ZarrMetadata, attributes: StoredAttributes) -> ArrayDescription:
-    """Return an array from its metadata; one that is not read has the reason in ``problem``."""
+    """Return the description of an array from its metadata. If the array cannot be read, ``problem`` is the reason."""
     problem = ""
     shape = metadata.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):

@@ -182,7 +182,7 @@ class _RecordConverter:
             raise BrokenRecordError(f"a record of kind {kind} is damaged") from error
 
     def convert_chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
-        """Yield the records of a chunk, or the complete ones of a truncated chunk.
+        """Yield the records of a chunk; if the chunk is truncated (not ``complete``), those records that are complete.
 
         Returns a `LostChunk` if a complete chunk is damaged, because none of its records can be trusted, else None.
         """

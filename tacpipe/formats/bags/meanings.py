@@ -237,7 +237,7 @@ def _joint(leaf: Leaf, index: int, number: int, joint: str) -> PartColumn:
 
 
 def _multi_array_parts(shape: MessageShape) -> list[MessagePart]:
-    """Return an array of std_msgs with one column per element, placed by the dimensions in its layout."""
+    """Return the part of an array of std_msgs: one column per element, with its position along the layout's dimensions."""
     layout = {leaf.path[1:]: leaf for leaf in shape.leaves if leaf.path[0] == "layout"}
     dimensions = [
         (shape.text(layout[path]), shape.number(layout[(*path[:2], "size")])) for path in layout if path[-1] == "label"

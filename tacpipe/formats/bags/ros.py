@@ -41,10 +41,10 @@ def parse_definitions(name: str, kind: Definition, text: str) -> Types:
         return _builtin_types(name)
     try:
         if kind == "idl":
-            parts = text.split("=" * 80 + "\n")
+            sections = text.split("=" * 80 + "\n")
             definitions: dict[str, tuple[Any, Any]] = {}  # constants and fields by type
-            for part in parts:
-                body = part.partition("\n")[2] if part.startswith("IDL: ") else part
+            for section in sections:
+                body = section.partition("\n")[2] if section.startswith("IDL: ") else section
                 definitions |= get_types_from_idl(body) if body.strip() else {}
         else:
             definitions = dict(get_types_from_msg(text, name))

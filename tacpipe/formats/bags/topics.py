@@ -84,7 +84,7 @@ class TopicRows:
         self._pieces.append(self._spill.add(table, orders))
 
     def finish(self, suffix: str) -> TopicStream:
-        """Return the rows ordered by their clock, as the stream with this suffix.
+        """Return a stream of the rows, ordered by their clock. ``suffix`` is the stream's suffix after the topic.
 
         Columns of constant or redundant times and frames are left out.
         """
@@ -92,17 +92,17 @@ class TopicRows:
         left_out = set() if self._published_apart else {PUBLISH}
         if clock == LOG and HEADER not in self._absent and not self._headers_set:
             left_out.add(HEADER)
-        described = {name: dict(values) for name, values in self._about.items()}
-        described |= {name: dict(ABOUT_TIME) for name in (LOG, PUBLISH, HEADER)}
-        described[clock]["clock"] = "header stamp" if clock == HEADER else "log time"
+        metadata = {name: dict(values) for name, values in self._about.items()}
+        metadata |= {name: dict(ABOUT_TIME) for name in (LOG, PUBLISH, HEADER)}
+        metadata[clock]["clock"] = "header stamp" if clock == HEADER else "log time"
         if FRAME in self._schema.names and len(self._frames) == 1:
             (frame,) = self._frames
             if frame:
-                described[clock]["frame"] = plain(frame)
+                metadata[clock]["frame"] = plain(frame)
             left_out.add(FRAME)
         kinds = {column.name: _column_type(column.type, column.name in self._absent) for column in self._schema}
         schema = pa.schema(
-            [pa.field(name, kind, metadata=described.get(name)) for name, kind in kinds.items() if name not in left_out]
+            [pa.field(name, kind, metadata=metadata.get(name)) for name, kind in kinds.items() if name not in left_out]
         )
 
         def read(piece: Piece) -> pa.Table:

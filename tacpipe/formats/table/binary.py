@@ -304,16 +304,16 @@ class ArrayMember:
 
 
 def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran's, and type from an array's header.
+    """Return the shape of an array, whether it is in Fortran order, and its type, from its header.
 
     Raises `ValueError` for an unknown format.
     """
     version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in read:
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
         raise ValueError(f"an array of format {version} is not known")
-    shape, columnwise, dtype = read[version](file)
-    return tuple(map(int, shape)), bool(columnwise), dtype
+    shape, is_fortran, dtype = readers[version](file)
+    return tuple(map(int, shape)), bool(is_fortran), dtype
 
 
 @contextlib.contextmanager

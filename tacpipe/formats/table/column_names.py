@@ -300,7 +300,7 @@ def declared_metadata(attributes: StoredAttributes) -> dict[str, str]:
 
 
 def declared_texts(attributes: StoredAttributes, key: str, count: int) -> list[str]:
-    """Return an attribute's text for each of ``count`` columns, or an empty list if its length differs.
+    """Return the texts in the attribute ``key``, one for each of ``count`` columns, or an empty list if its length differs.
 
     >>> declared_texts({"columns": ["a", "b"]}, "columns", 2), declared_texts({"columns": ["a"]}, "columns", 2)
     (['a', 'b'], [])

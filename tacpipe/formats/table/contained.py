@@ -133,7 +133,7 @@ class _ContainerShares:
         self._opened: dict[Path, object] = {}
 
     def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], Values]:
-        """Return the files of a recording by name, and metadata of shared containers that it depends on."""
+        """Return the files of a recording by name, and the values it depends on in containers shared by recordings."""
         files: dict[str, Path] = {}
         values: dict[str, Values] = {}  # values by name of a file
         names_by_path: dict[Path, list[str]] = {}

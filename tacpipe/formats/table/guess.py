@@ -303,8 +303,8 @@ def _is_labels(sample: FileSample) -> bool:
     """Return whether a table contains labels: it is short, has text, and has no time column."""
     if sample.text is None:
         return False
-    texts = any(isinstance(value, str) for values in sample.values.values() for value in values)
-    return texts and file_sample.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
+    has_text = any(isinstance(value, str) for values in sample.values.values() for value in values)
+    return has_text and file_sample.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
 
 
 def _labels_text(group: _FileGroup) -> str:

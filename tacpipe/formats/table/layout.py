@@ -366,7 +366,7 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
 
 
 def _expect_required(values: Values, place: str, container: Format | None) -> None:
-    """Raise `UsageError` if a required entry is missing or one does not fit the format.
+    """Raise `UsageError` if a required entry of a stream is missing, or an entry is not allowed for the stream's format.
 
     Containers require fewer entries, because they declare more.
     """

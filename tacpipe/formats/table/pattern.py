@@ -102,10 +102,10 @@ def fill_pattern(pattern: str, values: Mapping[str, str]) -> str:
 
 
 def generalize(paths: Sequence[PurePath]) -> str:
-    """Return a pattern that matches relative paths of one depth, and those of later recordings.
+    """Return a pattern that matches relative paths of equal depth, and the paths of later recordings.
 
-    Dates, numbers that differ and numbers that count recordings become placeholders. So does text that differs; the last
-    that differs is the trial. Other numbers stay: ``skin1.csv`` is a sensor.
+    Dates, numbers that differ, numbers that count recordings, and text that differs become placeholders; the last level
+    that differs contains the trial. Other numbers stay: ``skin1.csv`` is a sensor.
 
     >>> generalize([PurePath("2026-05-01 cork/trial_1/skin1.csv"), PurePath("2026-05-01 cork/trial_2/skin1.csv")])
     '{date} cork/trial_{trial}/skin1.csv'
@@ -115,13 +115,15 @@ def generalize(paths: Sequence[PurePath]) -> str:
     ('object{object}/{trial}/skin.csv', 'skin2.csv')
     """
     levels = list(zip(*(path.parts for path in paths), strict=True))
-    differing = [level for level, names in enumerate(levels) if len(set(names)) > 1]
-    last = differing[-1] if differing else len(levels) - 2  # the folder of a single file is the recording
-    names_in_use: dict[str, tuple[str, ...]] = {}
+    differing_levels = [level for level, names in enumerate(levels) if len(set(names)) > 1]
+    trial_level = (
+        differing_levels[-1] if differing_levels else len(levels) - 2
+    )  # the folder of a single file is the recording
+    texts_in_use: dict[str, tuple[str, ...]] = {}
     level_patterns = []
     for level, names in enumerate(levels):
-        text = _level_pattern([_tokens(name) for name in names], level, names_in_use, is_last=level == last)
-        level_patterns.append(f"{{{TRIAL}}}" if level == last and "{" not in text else text)
+        text = _level_pattern([_tokens(name) for name in names], level, texts_in_use, is_last=level == trial_level)
+        level_patterns.append(f"{{{TRIAL}}}" if level == trial_level and "{" not in text else text)
     return "/".join(level_patterns)
 
 

@@ -92,20 +92,20 @@ def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indice
 
 
 def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Iterator[tuple[str, pa.Table]]:
-    """Yield each recording in a block with its rows and their positions in the file, in order.
+    """Yield the name and the rows of each recording in a block; the column ``recording`` contains the names.
 
-    The positions count from ``start_row`` and are the last column.
+    The last column of the rows is their position in the file; the block starts at ``start_row``.
     """
     column = block.column(recording).cast(pa.string()).combine_chunks().dictionary_encode()
     codes, names = column.indices.fill_null(-1).to_numpy(zero_copy_only=False), column.dictionary.to_pylist()
     order = np.argsort(codes, kind="stable")
     block_columns = [block.column(name) for name in block.column_names]
-    plain = [
+    decoded = [
         values.cast(values.type.value_type) if pa.types.is_dictionary(values.type) else values
         for values in block_columns
     ]
     rows = pa.Table.from_arrays(
-        [*plain, pa.array(np.arange(start_row, start_row + len(block)))], [*block.column_names, ROW_COLUMN]
+        [*decoded, pa.array(np.arange(start_row, start_row + len(block)))], [*block.column_names, ROW_COLUMN]
     )
     if (np.diff(codes) < 0).any():  # otherwise the rows of each recording are contiguous, and nothing is copied
         rows = rows.take(pa.array(order))
@@ -172,25 +172,25 @@ def open_rows(path: Path, stream: StreamLayout) -> RowFile:
 
 
 def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
-    """Return the timestamps in a file with those of all rows of ``stream``, in ns (row,).
+    """Return the timestamps of all rows of ``stream`` in ns (row,), which are in a separate file at ``path``.
 
     They are in the column named by the stream's time, or in the file's only column. Raises `TacpipeError` for a file
     with several columns if none is named, and the errors of `stamps_of_column`.
     """
     kind = EXTENSIONS.get(extension(path), "csv")
-    clock = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
+    stamps_layout = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
     if kind == "csv":
         lines = file_sample.first_lines(path, stream.encoding)
-        clock_dialect = file_sample.detect_dialect(lines)
-        clock = replace(
-            clock,
-            separator=clock_dialect.separator,
-            decimal=clock_dialect.decimal,
-            comment=clock_dialect.comment,
-            header=clock_dialect.header,
-            skip_lines=clock_dialect.skip_lines,
+        dialect = file_sample.detect_dialect(lines)
+        stamps_layout = replace(
+            stamps_layout,
+            separator=dialect.separator,
+            decimal=dialect.decimal,
+            comment=dialect.comment,
+            header=dialect.header,
+            skip_lines=dialect.skip_lines,
         )
-    file = open_rows(path, clock)
+    file = open_rows(path, stamps_layout)
     names = file.names()
     column = stream.time.column or names[0]
     if column not in names or (len(names) > 1 and not stream.time.column):
@@ -198,10 +198,10 @@ def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
             f"{path} has the columns {listed(names, 6)}. Name the one with the stamps of [streams.{stream.name}] as column "
             f"in its time."
         )
-    clock = replace(clock, time=replace(clock.time, column=column))
+    stamps_layout = replace(stamps_layout, time=replace(stamps_layout.time, column=column))
     stamps_ns = [
-        stamps_of_column(block.column(column), clock, place)
-        for block, _, place in row_blocks(file, clock, reserved_types(file, clock), None, None)
+        stamps_of_column(block.column(column), stamps_layout, place)
+        for block, _, place in row_blocks(file, stamps_layout, reserved_types(file, stamps_layout), None, None)
     ]
     return np.concatenate(stamps_ns) if stamps_ns else np.zeros(0, np.int64)
 

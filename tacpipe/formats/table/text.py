@@ -330,7 +330,7 @@ class Workbook:
             return list(self.stream.names)
         if not self.stream.header:
             return [f"column{number}" for number in range(1, len(cells) + 1)]
-        names = [str(cell).strip() if cell is not None else f"column{n}" for n, cell in enumerate(cells, 1)]
+        names = [f"column{number}" if cell is None else str(cell).strip() for number, cell in enumerate(cells, 1)]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise TacpipeError(f"{self.path}: the header has more than one column {listed(repeated, 4)}. Rename one.")

@@ -244,11 +244,11 @@ def keys(columns: Sequence[AnyArray]) -> list[bytes]:
 
     Texts are represented by their hashes.
     """
-    texts = [column for column in columns if column.dtype.kind == "O"]
-    parts = [column for column in columns if column.dtype.kind != "O"]
-    parts += [np.array([hash(str(cell)) for cell in column.tolist()]) for column in texts]
-    rows = [np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1) for part in parts]
-    return [row.tobytes() for row in np.hstack(rows)]
+    text_columns = [column for column in columns if column.dtype.kind == "O"]
+    number_columns = [column for column in columns if column.dtype.kind != "O"]
+    number_columns += [np.array([hash(str(cell)) for cell in column.tolist()]) for column in text_columns]
+    column_bytes = [np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1) for column in number_columns]
+    return [row.tobytes() for row in np.hstack(column_bytes)]
 
 
 def start_of(table: pa.Table, samples: Samples) -> int | None:

@@ -35,19 +35,21 @@ class Connection:
         self._unsent = b""  # remaining bytes of a partly sent piece
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send as many pieces as the connection accepts. A partly sent piece is completed before any other."""
+        """Send as many pieces as the connection accepts, and return their sizes, 0 for pieces that were not sent.
+
+        A piece counts as sent if a part of it was sent; the next call sends the remaining bytes first.
+        """
         if self._unsent:
             self._unsent = self._unsent[self._send_some(self._unsent) :]
             if self._unsent:
                 return [0] * len(pieces)
         sizes = [len(piece) for piece in pieces]
         content = b"".join(pieces)
-        sent = self._send_some(content)
-        parts = sent_sizes(sizes, sent)
-        for piece, part in zip(pieces, parts, strict=True):
-            if 0 < part < len(piece):
-                self._unsent = piece[part:]
-        return [size if part else 0 for size, part in zip(sizes, parts, strict=True)]
+        accepted = sent_sizes(sizes, self._send_some(content))  # bytes of each piece
+        for piece, size in zip(pieces, accepted, strict=True):
+            if 0 < size < len(piece):
+                self._unsent = piece[size:]
+        return [len(piece) if size else 0 for piece, size in zip(pieces, accepted, strict=True)]
 
     def _send_some(self, data: bytes) -> int:
         """Send some bytes and return their number; 0 if the host does not read or has disconnected."""

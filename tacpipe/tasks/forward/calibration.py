@@ -77,7 +77,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Window
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
     with terminal.progress_bar("calibrate", len(recordings.recordings)) as advance:
-        for number, (name, shard) in enumerate(sorted(recordings.recordings.items())):
+        for index, (name, shard) in enumerate(sorted(recordings.recordings.items())):
             track = forecaster.track(shard)
             check_rate(track, forecaster)
             starts = fewer(track.starts(forecaster.context, forecaster.horizon), limit)
@@ -88,11 +88,11 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Window
                         forecaster.error_features(forecast.windows, past, forecast.count),
                         (truth - forecast.count).transpose(0, 2, 1).astype(np.float32),
                         (truth - past[:, -1:]).transpose(0, 2, 1).astype(np.float32),
-                        np.full(len(past), number),
+                        np.full(len(past), index),
                     )
                 )
             advance(note=name)
     if not parts:
-        beginning = f"The {len(recordings.recordings)} recordings hold"
-        raise tracks.no_window(beginning, recordings, forecaster.context, forecaster.horizon)
+        subject = f"The {len(recordings.recordings)} recordings hold"
+        raise tracks.no_window(subject, recordings, forecaster.context, forecaster.horizon)
     return WindowErrors(*map(np.concatenate, zip(*parts, strict=True)))

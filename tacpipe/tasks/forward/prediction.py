@@ -75,9 +75,9 @@ def _collect_predictions(
             counts = forecast.count[:, step_indices].transpose(1, 2, 0).astype(np.float32, order="C")
             bands = np.empty((len(level_indices), *counts.shape), np.float32)  # (level, step, channel, window)
             for first in range(0, len(forecast.count) if level_indices else 0, CHUNK):
-                part = slice(first, min(first + CHUNK, len(forecast.count)))
-                all_quantiles = model_quantiles(forecaster, track, forecast, part)
-                bands[..., part] = all_quantiles[:, step_indices][..., level_indices].transpose(3, 1, 2, 0)
+                batch = slice(first, min(first + CHUNK, len(forecast.count)))
+                all_quantiles = model_quantiles(forecaster, track, forecast, batch)
+                bands[..., batch] = all_quantiles[:, step_indices][..., level_indices].transpose(3, 1, 2, 0)
             t_ns = track.t_ns[forecast.now]
             rows = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
             gathered[name].add(rows)

@@ -91,11 +91,14 @@ class BatchPairs:
         return rows[:, order]
 
     def _pair_rows(self, generator: torch.Generator | None) -> Tensor:
-        """Return rows (sensor, row) of one class each, followed by rows with a single slide without label."""
+        """Return slide indices (sensor, row): rows of one class each, then one row per slide without a label.
+
+        `NONE` stands for a missing slide.
+        """
         blocks = []
         first = next(iter(self.classes.values()))
-        all_classes = sorted({int(c) for classes in self.classes.values() for c in set(classes.tolist()) if c != NONE})
-        for number in all_classes:
+        all_classes = {int(number) for classes in self.classes.values() for number in set(classes.tolist())} - {NONE}
+        for number in sorted(all_classes):
             members = []
             for classes in self.classes.values():
                 sensor_class = number if classes is first or self.partners is None else self.partners[number]

@@ -234,7 +234,7 @@ class EvaluatedSlips:
 
 
 def brier_measure() -> Measure:
-    """Return the conversion of sums of squared errors and weights to Brier scores."""
+    """Return the `Measure` that turns sums (draw, [sum of squared errors, sum of weights]) into Brier scores."""
 
     def error(sums: AnyFloats) -> AnyFloats:
         return np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1e-12), np.nan)

@@ -209,13 +209,13 @@ class FingerReader:
         )
 
     def track_of(self, recording: Recording, raw: Mapping[str, RawFinger]) -> GraspTrack:
-        """Return a recording as a track, from the values of its fingers by stream."""
-        parts = tuple(raw[finger.stream].above_rest(finger, self.rest_ns) for finger in self.fingers)
-        t_ns = parts[0].t_ns
-        newest = np.stack([np.searchsorted(part.t_ns, t_ns, side="right") - 1 for part in parts], axis=1)
-        first = [part.begin + finger.rows - 1 for part, finger in zip(parts, self.fingers, strict=True)]
+        """Return a recording as a track; ``raw`` contains the values of its fingers by stream."""
+        fingers = tuple(raw[finger.stream].above_rest(finger, self.rest_ns) for finger in self.fingers)
+        t_ns = fingers[0].t_ns
+        newest = np.stack([np.searchsorted(signal.t_ns, t_ns, side="right") - 1 for signal in fingers], axis=1)
+        first = [signal.begin + finger.rows - 1 for signal, finger in zip(fingers, self.fingers, strict=True)]
         ready = np.asarray((newest >= np.array(first)).all(axis=1))
-        start_ns = min((int(part.t_ns[0]) for part in parts if len(part.t_ns)), default=0)
+        start_ns = min((int(signal.t_ns[0]) for signal in fingers if len(signal.t_ns)), default=0)
         label = str(recording.attributes.get("object") or recording.name)
         return GraspTrack(
             recording.name,
@@ -223,7 +223,7 @@ class FingerReader:
             recording.digest,
             t_ns,
             start_ns,
-            parts,
+            fingers,
             newest,
             ready,
             read_labels(recording),

@@ -156,7 +156,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 def _evaluation_result(
     model: Mapping[str, bytes], predictor: Predictor, grasps: Grasps, recordings: Dataset, advance: Callable[..., None]
 ) -> Result:
-    """Return the result of a model on grasps; ``advance`` updates the progress bar after their prediction.
+    """Evaluate a model on grasps, and return the result. ``advance`` updates the progress bar.
 
     Raises `TacpipeError` if there are no grasps or the model has no baselines.
     """
@@ -244,9 +244,9 @@ def _headlines(
 
 
 def _scores(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> TouchScores:
-    """Return the errors of every predictor on the grasps of ``mask``, over all of them and by object.
+    """Return the errors of every predictor on the grasps selected by ``mask`` (grasp,), in total and by object.
 
-    Intervals are over objects if any object is novel, otherwise over grasps. ``is_known`` is (grasp,).
+    Intervals resample objects if any object is novel, otherwise grasps. ``is_known`` (grasp,) marks known objects.
     """
     if not mask.any():
         return TouchScores({"grasps": 0})

@@ -69,11 +69,11 @@ class Repeatability:
 def repeatability(
     values: Floats, objects: Sequence[str], pairs: Pairs, low_mm: float, high_mm: float, seed: int = 0
 ) -> Repeatability:
-    """Return the repeatability of values (grasp, value), device counts, from pairs in a distance bin.
+    """Return the repeatability of values (grasp, value), in device counts, over the pairs in a distance bin.
 
     The bin contains distances of at least ``low_mm`` and less than ``high_mm``. Intervals are the middle 95 % over
-    resampled grasps; a pair's weight is the product of the counts of its two grasps. They are NaN if there are no
-    pairs.
+    resampled grasps, in which a pair has the product of the counts of its two grasps as weight. The results are NaN if
+    there are no pairs.
     """
     in_bin = (pairs.distance_mm >= low_mm) & (pairs.distance_mm < high_mm)
     first, second = pairs.first[in_bin], pairs.second[in_bin]
@@ -126,7 +126,7 @@ def variances(values: Floats, object_index: Indices, weight: Floats) -> tuple[Fl
 def table(
     readings: Mapping[str, Floats], contacts_m: Floats, objects: Sequence[str]
 ) -> list[tuple[float, float, dict[str, Repeatability]]]:
-    """Return the bounds of each distance bin in mm, low and high, and `repeatability` by target."""
+    """Return, for each distance bin, its lower and upper bound in mm and the `repeatability` by target."""
     pairs = Pairs.from_contacts(contacts_m, objects)
     return [
         (low, high, {name: repeatability(values, objects, pairs, low, high) for name, values in readings.items()})

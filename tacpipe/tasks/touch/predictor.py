@@ -154,18 +154,18 @@ def fit_shrinkage(
             f"--shrink-novel needs training grasps of at least {MIN_OBJECTS} objects, not {len(object_names)}, since each "
             f"is left out once. Label objects, or leave out --shrink-novel."
         )
-    products = {name: [0.0, 0.0] for name in readings}  # sums of prediction times truth, and of prediction squared
+    products, squares = dict.fromkeys(readings, 0.0), dict.fromkeys(readings, 0.0)
     for name in object_names:
         in_training = names != name
         predicted = predict(in_training)
         for target, values in readings.items():
             constant = values[in_training].mean(axis=0)
-            beyond = predicted[target] - constant
-            products[target][0] += float((beyond * (values[~in_training] - constant)).sum())
-            products[target][1] += float(np.square(beyond).sum())
-    factor = {
-        name: float(np.clip(product / square, 0, 1)) if square > 0 else 0.0
-        for name, (product, square) in products.items()
+            deviation = predicted[target] - constant
+            products[target] += float((deviation * (values[~in_training] - constant)).sum())
+            squares[target] += float(np.square(deviation).sum())
+    factor = {  # least squares
+        target: float(np.clip(products[target] / squares[target], 0, 1)) if squares[target] > 0 else 0.0
+        for target in readings
     }
     return Shrinkage(factor, {name: values.mean(axis=0) for name, values in readings.items()})
 

@@ -158,7 +158,7 @@ def _errors(
     predicted: _Offline,
     steps: tuple[int, ...],
 ) -> tuple[int, Sums]:
-    """Return the number of rows that all predictors have, and the sums of their errors over these rows by predictor."""
+    """Return the number of rows for which all predictors have values, and each predictor's sums of errors over them."""
     row_ns, values = session.t_ns, session.values
     if not set(steps) <= set(session.steps) or chain.rest is None or not len(predicted.now):
         return 0, {}
@@ -176,14 +176,14 @@ def _errors(
     usable &= np.isin(row_ns, grid_ns)
     if not usable.any():
         return 0, {}
-    offline_rest = counts[0] - track.tactile[0]  # offline
-    step_places = [session.steps.index(step) for step in steps]
+    offline_rest = counts[0] - track.tactile[0]
+    step_indices = [session.steps.index(step) for step in steps]
     persistence = np.stack([newest[at_ns] for at_ns in row_ns[usable].tolist()])[:, None] + chain.rest
     windows = nearest[usable]
     later = counts[predicted.now[windows][:, None] + np.array(steps)].astype(np.float64)
     now = counts[predicted.now[windows]].astype(np.float64)[:, None]
     errors = {
-        LIVE: measures.sums(values[usable][:, step_places] + chain.rest, ahead[usable]),
+        LIVE: measures.sums(values[usable][:, step_indices] + chain.rest, ahead[usable]),
         LIVE_STILL: measures.sums(persistence, ahead[usable]),
         OFFLINE: measures.sums(predicted.ahead[windows][:, [step - 1 for step in steps]] + offline_rest, later),
         STILL: measures.sums(now, later),

@@ -273,16 +273,19 @@ def shown_steps(runs: Sequence[ForwardResult]) -> tuple[int, ...]:
 def sums_by_recording(
     run: ForwardResult, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
 ) -> dict[str, AnyFloats]:
-    """Return the `headline.sums` of a predictor by recording, or empty if it has no errors in a group of channels."""
+    """Return the `headline.sums` of a predictor by recording, or an empty dict if it has no errors for ``group``.
+
+    ``group`` is a group of channels. Recordings without windows, or whose object is not ``known_objects``, are left out.
+    """
     errors = run.errors
     predictor_sums, persistence_sums = errors.of(predictor, group), errors.of(BASELINE, group)
     if predictor_sums is None or persistence_sums is None:
         return {}
-    at, width = [errors.steps.index(step) for step in steps], errors.channels[group]
+    step_indices, width = [errors.steps.index(step) for step in steps], errors.channels[group]
     return {
         name: headline.sums(
-            (predictor_sums[0][index, at], predictor_sums[1][index, at]),
-            (persistence_sums[0][index, at], persistence_sums[1][index, at]),
+            (predictor_sums[0][index, step_indices], predictor_sums[1][index, step_indices]),
+            (persistence_sums[0][index, step_indices], persistence_sums[1][index, step_indices]),
             float(errors.windows[index]) * width,
         )
         for index, name in enumerate(errors.recordings)

@@ -264,20 +264,25 @@ def count_nearest_partners(
 def _latent_chart(method: Method) -> Chart | None:
     """Return a chart of the latents of one run of a method, or of one run per sensor if each has its own model.
 
-    None without latents of two sensors.
+    Returns None if there are no latents of two sensors.
     """
-    rows = _paired_predictions(method.details)
-    if rows is None:
+    sensors_and_predictions = _paired_predictions(method.details)
+    if sensors_and_predictions is None:
         return None
-    sensors, parts = rows
-    points = project_on_plane([_part_latents(part) for part in parts])
+    sensors, predictions = sensors_and_predictions
+    points = project_on_plane([_part_latents(sensor_predictions) for sensor_predictions in predictions])
     stored_partners = method.details[0].config.get("partners", {})
     partners = {int(material): int(partner) for material, partner in stored_partners.items()}
-    nearest_count, count = count_nearest_partners(parts[0], parts[1], partners)
+    nearest_count, count = count_nearest_partners(predictions[0], predictions[1], partners)
     dots: list[charts.DataRow] = []
-    for sensor, part, positions in zip(sensors, parts, points, strict=True):
+    for sensor, sensor_predictions, positions in zip(sensors, predictions, points, strict=True):
         shape = sensor_title(sensor)
-        for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, positions, strict=True):
+        for name, recording, (x, y) in zip(
+            sensor_predictions.named(sensor_predictions.materials),
+            sensor_predictions.recordings,
+            positions,
+            strict=True,
+        ):
             dots.append({"name": str(name), "x": float(x), "y": float(y), "shape": shape, "tip": str(recording)})
     spec = charts.scatter(
         dots,
@@ -286,24 +291,29 @@ def _latent_chart(method: Method) -> Chart | None:
         shapes=[sensor_title(sensor) for sensor in sensors],
         legend=False,
     )
-    spec["layer"].append(charts.joined(_latent_rows(points, parts, partners)))
+    spec["layer"].append(charts.joined(_latent_rows(points, predictions, partners)))
     partner_text = "the material that it was paired with" if partners else "the same material"
     caption = f"For {nearest_count} of {count} materials, the other sensor's nearest mean is {partner_text}."
     return Chart(f"{method.name}: latents of both sensors", spec, caption)
 
 
 def _latent_rows(
-    points: Sequence[AnyFloats], parts: Sequence[SlidePredictions], partners: Mapping[int, int]
+    points: Sequence[AnyFloats], predictions: Sequence[SlidePredictions], partners: Mapping[int, int]
 ) -> list[tuple[str, AnyFloats, AnyFloats]]:
-    """Return each material's name, and the means (coordinate,) of its points for both sensors.
+    """Return each material's name, and the mean (coordinate,) of its points for either sensor.
 
-    The mean for the second sensor is that of the material's partner, if it has a partner.
+    For the second sensor, it is the mean of the material's partner, if it has a partner.
     """
     means = [
-        {int(material): positions[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
-        for positions, part in zip(points, parts, strict=True)
+        {
+            int(material): positions[sensor_predictions.materials == material].mean(axis=0)
+            for material in np.unique(sensor_predictions.materials)
+        }
+        for positions, sensor_predictions in zip(points, predictions, strict=True)
     ]
-    names = dict(zip(parts[0].materials.tolist(), parts[0].named(parts[0].materials).tolist(), strict=True))
+    names = dict(
+        zip(predictions[0].materials.tolist(), predictions[0].named(predictions[0].materials).tolist(), strict=True)
+    )
     return [
         (str(names[material]), first_mean, means[1][partners.get(material, material)])
         for material, first_mean in means[0].items()
@@ -342,13 +352,13 @@ def holds_slides(dataset: Dataset) -> bool:
 
 
 def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
-    """Return charts of typical slides; empty if there are none."""
+    """Return a fold with the counts of slides and charts of a typical slide per sensor, or an empty list without slides."""
     shards = [shard for dataset in datasets for shard in dataset.recordings.values() if holds_slides(dataset)]
     if not shards:
         return []
     published = all(is_published(dataset, MaterialResult.SETS) for dataset in datasets)
     sensors = ordered_sensors([str(shard.attributes.get("sensor", "")) for shard in shards])
-    parts = [
+    descriptions = [
         _describe_counts([shard for shard in shards if shard.attributes.get("sensor", "") == sensor], sensor)
         for sensor in sensors
     ]
@@ -359,7 +369,7 @@ def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
         ]
         if sensor_shards:
             figures += _profile_charts(typical_slide(sensor_shards), sensor, published)
-    return [Fold("The slides", [SmallPrint(" ".join(parts)), *([Charts(figures)] if figures else [])])]
+    return [Fold("The slides", [SmallPrint(" ".join(descriptions)), *([Charts(figures)] if figures else [])])]
 
 
 def typical_slide(shards: Sequence[Recording]) -> Recording:

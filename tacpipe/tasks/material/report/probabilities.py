@@ -143,15 +143,17 @@ def _reliability_chart(title: str, method: Method, sensor: str, answers: pd.Data
     bins = np.array_split(
         np.arange(len(known_rows)), int(np.clip(len(known_rows) // MIN_BIN_COUNT, 1, calibration.BINS))
     )
-    binned = [
+    points = [
         (float(known_rows.iloc[indices].probability.mean()), rate_of(known_rows.iloc[indices], "right"))
         for indices in bins
         if len(indices)
     ]
-    right, low, high = ([getattr(value, name) for _, value in binned] for name in ("fraction", "low", "high"))
-    lines = [Curve("calibrated", [probability for probability, _ in binned], right, low, high)]
-    if before := _uncalibrated_points(method, sensor):
-        lines.append(Curve("as trained", [value for value, _ in before], [value for _, value in before], dashed=True))
+    fractions, low, high = ([getattr(value, name) for _, value in points] for name in ("fraction", "low", "high"))
+    lines = [Curve("calibrated", [probability for probability, _ in points], fractions, low, high)]
+    if uncalibrated := _uncalibrated_points(method, sensor):
+        lines.append(
+            Curve("as trained", [value for value, _ in uncalibrated], [value for _, value in uncalibrated], dashed=True)
+        )
     spec = charts.lines(lines, "stated probability", "fraction right", diagonal=(0, 1), height=220)
     return Chart(title, spec)
 

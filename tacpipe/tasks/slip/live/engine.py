@@ -62,7 +62,7 @@ class FingerSoFar:
         self._begin = 0  # first row after the level at rest
 
     def add(self, t_ns: Times, raw: AnyFloats) -> None:
-        """Append rows (row,) and (row, channel); rows before the level at rest is measured are added when it is."""
+        """Append rows with times (row,) and values (row, channel). They are buffered until the rest level is measured."""
         times, values = t_ns, raw
         if self.rest is None:
             self._first.append((t_ns, raw))
@@ -76,10 +76,10 @@ class FingerSoFar:
         if len(scaled):
             self._filled = scaled[-1]
         self.t_ns, self.values = np.concatenate([self.t_ns, times]), np.concatenate([self.values, scaled])
-        kept = self.finger.rows + SPARE_ROWS
-        if len(self.t_ns) > 2 * kept:
-            self._dropped += len(self.t_ns) - kept
-            self.t_ns, self.values = self.t_ns[-kept:], self.values[-kept:]
+        retained_rows = self.finger.rows + SPARE_ROWS
+        if len(self.t_ns) > 2 * retained_rows:
+            self._dropped += len(self.t_ns) - retained_rows
+            self.t_ns, self.values = self.t_ns[-retained_rows:], self.values[-retained_rows:]
 
     def newest_row(self, t_ns: int) -> int:
         """Return the index of the newest row at a time; -1 before the first one."""

@@ -48,7 +48,10 @@ class TouchReport(TaskReport):
     def columns(
         self, context: Context, comparison: Comparison
     ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return R², skill over the constant, RMSE over runs, batch mean and MAE: heads and functions of a row."""
+        """Return further columns: R², skill over the constant, RMSE over runs, batch mean and MAE.
+
+        A column is its heading and a function that returns the cell of a row.
+        """
         target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
         known_objects = comparison.question.part.startswith(headlines.PARTS[True])
 
@@ -57,20 +60,24 @@ class TouchReport(TaskReport):
             runs = [run.details.predictions for run in row.method.of(comparison.question)]
             return predictions.score(runs, target, known_objects, row.predictor)
 
-        def cell(value: Callable[[Score], Cell]) -> Callable[[ComparisonRow], Cell]:
-            return lambda row: value(found) if (found := score(row)) else Cell(NONE)
+        def column(to_cell: Callable[[Score], Cell]) -> Callable[[ComparisonRow], Cell]:
+            def cell(row: ComparisonRow) -> Cell:
+                row_score = score(row)
+                return to_cell(row_score) if row_score else Cell(NONE)
+
+            return cell
 
         return [
             (
                 "R²",
-                cell(
+                column(
                     lambda result: Cell(blocks.fixed(result.r2, 2), value=None if math.isnan(result.r2) else result.r2)
                 ),
             ),
-            ("skill over the constant", cell(lambda result: blocks.interval(*result.skill))),
-            ("RMSE over runs", cell(lambda result: blocks.with_sd(result.each.mean, result.each.sd))),
-            ("batch mean", cell(lambda result: Cell(blocks.fixed(result.batch_mean, 4), value=result.batch_mean))),
-            ("MAE (counts)", cell(lambda result: blocks.number(predictions.to_counts(result.target, result.mae), 3))),
+            ("skill over the constant", column(lambda result: blocks.interval(*result.skill))),
+            ("RMSE over runs", column(lambda result: blocks.with_sd(result.each.mean, result.each.sd))),
+            ("batch mean", column(lambda result: Cell(blocks.fixed(result.batch_mean, 4), value=result.batch_mean))),
+            ("MAE (counts)", column(lambda result: blocks.number(predictions.to_counts(result.target, result.mae), 3))),
         ]
 
     def sentence(self, context: Context) -> tuple[str, str]:

@@ -208,16 +208,16 @@ def holds_grasps(dataset: Dataset) -> bool:
 
 
 def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[Fold]:
-    """Return charts of the clouds of ``chosen`` grasps (name -> description); empty without datasets.
+    """Return a fold with charts of the clouds of ``chosen`` grasps (name -> description), or of the first grasps.
 
-    If none of them is in the datasets, the first grasps are drawn.
+    The first grasps are drawn if none of the chosen ones is in the datasets. Without grasps, the list is empty.
     """
     shards = {name: shard for dataset in datasets for name, shard in dataset.recordings.items() if _has_grasp(shard)}
     if not shards:
         return []
-    first = dict.fromkeys(sorted(shards)[:MAX_CLOUDS], "")
-    descriptions = {name: words for name, words in chosen.items() if name in shards} or first
-    figures = [_cloud_chart(shards[name], words) for name, words in descriptions.items()]
+    first_grasps = dict.fromkeys(sorted(shards)[:MAX_CLOUDS], "")
+    descriptions = {name: description for name, description in chosen.items() if name in shards} or first_grasps
+    figures = [_cloud_chart(shards[name], description) for name, description in descriptions.items()]
     return fold("Clouds and their grasps", Charts(figures), SmallPrint(CLOUD_COLOURS))
 
 

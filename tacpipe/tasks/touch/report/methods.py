@@ -131,8 +131,8 @@ def grouped_by_split(methods: Sequence[Method]) -> list[list[Method]]:
     """Return methods grouped by the split of their grasps, in the order of `ordered_splits`."""
     order = ordered_splits([result for method in methods for result in method.details])
     return [
-        [method for method in methods if (method.settings["split"], method.settings["simulated"]) == key]
-        for key in order
+        [method for method in methods if (method.settings["split"], method.settings["simulated"]) == question]
+        for question in order
     ]
 
 
@@ -142,7 +142,7 @@ def default_method(methods: Sequence[Method]) -> Method:
 
 
 def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
-    """Return one method per architecture: most runs, then one that reads colour, then the shortest name."""
+    """Return one method per architecture: that with the most runs, then one that reads colour, then the shortest name."""
 
     def preference(method: Method) -> tuple[int, bool, int, str]:
         return (
