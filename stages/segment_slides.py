@@ -142,11 +142,13 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
         params.speed_m_s, params.speed_tolerance, params.min_s, params.pressure_low, params.pressure_high
     )
     rows = slice(first, stop)
-    described = slide_signals.slide_statistics(pressure[rows], {name: column[rows] for name, column in profile.items()})
-    departures = slide_signals.protocol_deviations(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, described)
-    attributes = {**described, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
-    attributes |= {"outside_protocol": bool(departures)} | (
-        {"outside_protocol_why": "; ".join(departures)} if departures else {}
+    statistics = slide_signals.slide_statistics(
+        pressure[rows], {name: column[rows] for name, column in profile.items()}
+    )
+    deviations = slide_signals.protocol_deviations(protocol, int(t_ns[slide[1] - 1] - t_ns[slide[0]]) / 1e9, statistics)
+    attributes = {**statistics, "slide_frames": stop - first, "spikes": int(spikes[rows].sum())}
+    attributes |= {"outside_protocol": bool(deviations)} | (
+        {"outside_protocol_why": "; ".join(deviations)} if deviations else {}
     )
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:

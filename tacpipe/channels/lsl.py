@@ -121,7 +121,10 @@ def parse(text: str | bytes) -> LslDescription:
 
 
 def _channels(described: Sequence[ET.Element], count: int, kind: str, *, text: bool) -> tuple[LslChannel, ...]:
-    """Return ``count`` channels: the described ones if their number matches, else numbered ones; ``text`` for texts."""
+    """Return ``count`` channels, named as in ``described`` if that has ``count`` channels, else with numbers.
+
+    ``kind`` is the type of the stream; if ``text``, its values are texts.
+    """
     labels = [element.findtext("label", "").strip() for element in described] if len(described) == count else []
     if not all(labels) or not labels:
         digits = max(2, len(str(count)))

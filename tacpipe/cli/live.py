@@ -194,13 +194,13 @@ def _run_unrecorded(recorder: Recorder, duration_s: float | None, view: Any, is_
     """Run the rig without recording until it ``is_over`` or ``duration_s`` have passed; None for no limit."""
     from tacpipe.recording import clock
 
-    began_s = clock.now_s()
+    start_s = clock.now_s()
     recorder.follow()
 
-    def over() -> bool:
-        return is_over() or (duration_s is not None and clock.now_s() - began_s >= duration_s)
+    def should_end() -> bool:
+        return is_over() or (duration_s is not None and clock.now_s() - start_s >= duration_s)
 
-    recorder.run(over, lambda: view.show(f"live, not recorded, {clock.now_s() - began_s:.0f} s"))
+    recorder.run(should_end, lambda: view.show(f"live, not recorded, {clock.now_s() - start_s:.0f} s"))
 
 
 def _report(

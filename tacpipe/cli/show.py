@@ -223,7 +223,7 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
 
 
 def _split_text(value: ShownSplit) -> list[str]:
-    """Return the number of recordings with each role, one line per fold, and the split's params."""
+    """Return lines with the number of recordings per role, one line per fold, and the split's params."""
     existing = {role for counts in value["folds"].values() for role in counts}
     roles = [*(role for role in ROLES if role in existing), *sorted(existing.difference(ROLES))]
     widths = {role: max(8, len(role) + 2) for role in roles}

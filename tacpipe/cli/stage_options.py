@@ -264,9 +264,9 @@ def summary(name: str, stage: AnyStage) -> str:
     The last paragraph is an example, generated from the stage's arguments if the docstring has none.
     """
     module = stage.function.__module__
-    texts = (sys.modules[module].__doc__, stage.function.__doc__)
-    first, second = texts if registry.is_named_after(module, name) else reversed(texts)
-    text = inspect.cleandoc(first or second or "")
+    module_doc, function_doc = sys.modules[module].__doc__, stage.function.__doc__
+    docs = (module_doc, function_doc) if registry.is_named_after(module, name) else (function_doc, module_doc)
+    text = inspect.cleandoc(docs[0] or docs[1] or "")
     return text if EXAMPLE in text else f"{text}\n\n{EXAMPLE}{example(name, stage)}"
 
 

@@ -57,10 +57,10 @@ Settings = Mapping[str, Scalar]  # params and other settings of a method, by nam
 def distinct_names(
     methods: Sequence[tuple[str, Settings]], usual: Collection[str | tuple[str, Scalar]] = ()
 ) -> list[tuple[str, Settings]]:
-    """Return a unique name for each method, given as first name and settings, and the settings in that name.
+    """Return a unique name for each method, which is given as first name and settings, and the settings in that name.
 
     A name includes the settings in which methods with the same first name differ, except empty ones and those in
-    ``usual``: names, or names with values.
+    ``usual``, which contains names of settings, or pairs of name and value.
 
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
@@ -205,17 +205,16 @@ class Method(Generic[Details]):
 def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Scalar]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    Runs of a task with equal method, settings and error units form one method. Names include the settings in which
-    methods with the same first name differ, except empty ones and those in ``usual``: names, or names with values.
+    Runs of a task with equal method, settings and error units form one method. Names are those of `distinct_names`.
     """
     by_key: dict[str, list[ComparedRun]] = {}
     for run in runs:
         by_key.setdefault(_key(run), []).append(run)
-    firsts = [same[0] for same in by_key.values()]
-    names = distinct_names([(method.method, method.settings) for method in firsts], usual)
+    first_runs = [method_runs[0] for method_runs in by_key.values()]
+    names = distinct_names([(run.method, run.settings) for run in first_runs], usual)
     methods = [
-        Method(name, same[0].family or same[0].method, same[0].settings, differing, tuple(same))
-        for (name, differing), same in zip(names, by_key.values(), strict=True)
+        Method(name, first.family or first.method, first.settings, differing, tuple(method_runs))
+        for (name, differing), first, method_runs in zip(names, first_runs, by_key.values(), strict=True)
     ]
     return sorted(methods, key=lambda method: method.name)
 

@@ -235,8 +235,8 @@ def connect_duckdb(dataset: Dataset) -> duckdb.DuckDBPyConnection:
 
     connection = duckdb.connect()
     for stream in sorted({stream for recording in dataset for stream in recording.streams}):
-        having = dataset.only(recording.name for recording in dataset if stream in recording.streams)
-        connection.register(stream or ONE_TABLE, having.table(stream))
+        recordings_with_stream = dataset.only(recording.name for recording in dataset if stream in recording.streams)
+        connection.register(stream or ONE_TABLE, recordings_with_stream.table(stream))
     names = pa.table({"recording": pa.array(list(dataset.recordings), pa.string())})
     rows = {recording.name: names.slice(index, 1) for index, recording in enumerate(dataset)}
     label_names = [name for name in _names(dataset) if name != "recording"]

@@ -112,9 +112,8 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     current = _is_current(directory, manifest)
     stale: dict[str, str] = {}
     removed: set[str] = set()
-    if current or (
-        manifest.exported and not relabelled
-    ):  # files of an export are large copies, so correct ones are not written again
+    # files of an export are large copies, so correct ones are not written again
+    if current or (manifest.exported and not relabelled):
         stale = dict(_stale(store, manifest, directory))
     if not current and relabelled:
         stale, removed = _compare_pages(_current_manifest(directory), manifest, directory)

@@ -162,7 +162,7 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
 
 
 def _has_equal_content(before: Manifest, now: Manifest) -> bool:
-    """Return whether a manifest with pages and one without have the same content."""
+    """Return whether two manifests, of which only one has pages, have the same content."""
     if (before.pages is None) == (now.pages is None) or len(before.recordings) != len(now.recordings):
         return False
     entries = pages.compared(before.recordings, now.recordings)

@@ -479,7 +479,7 @@ class KeyRecordings(Recordings, Written):
             yield {name: key_entry(entry) for name, entry in part.items()}
 
     def written(self) -> Iterator[bytes]:
-        """Yield the canonical JSON of all recordings, a page at a time; a key and its record ask several times for it."""
+        """Yield the canonical JSON of all recordings, page by page. Pages are cached, because it is needed several times."""
         yield b"{"
         for number in range(len(self.pages)):
             text = self._json_by_page.get(number)

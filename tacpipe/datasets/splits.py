@@ -320,9 +320,9 @@ def _assign_folds(
 def _assign_parts(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, count: int
 ) -> dict[str, int]:
-    """Return the part of each recording, from 0; shuffled recordings take turns, stratum by stratum.
+    """Return the index of each recording's part, of ``count`` parts whose sizes differ by at most one.
 
-    Part sizes differ by at most one.
+    Recordings are shuffled within each stratum, and then assigned to the parts in turn.
     """
     rng = np.random.default_rng(scheme.seed)
     strata = _strata(names, attributes, scheme).values()
@@ -355,9 +355,9 @@ def _unknown(
 
 
 def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
-    """Return by value the fold in which an older split tests all of its recordings.
+    """Return, for each value, the fold in which an older split tests all recordings with this value.
 
-    Raises `TacpipeError` if it has no such fold.
+    Raises `TacpipeError` if there is no such fold.
     """
     folds_of: dict[str, set[int]] = {name: set() for name, _ in keep if name in values}
     for (name, fold), role in keep.items():

@@ -144,7 +144,10 @@ class ByRecording:
     def _find_stored(
         self, name: str, tasks: Sequence[WorkerTask]
     ) -> tuple[dict[str, ComputedResult], list[WorkerTask]]:
-        """Return the stored records by recording, and the tasks that must be computed."""
+        """Return the stored records by recording, and the tasks of recordings that must be computed.
+
+        To compare results, all tasks are returned as dry runs.
+        """
         stored: dict[str, ComputedResult] = {}
         missing: list[WorkerTask] = []
         rerun = self._reruns(name)

@@ -102,7 +102,7 @@ def _value_text(name: str, values: Variables, place: str) -> str:
 
 
 def _value(name: str, values: Variables, place: str) -> Any:
-    """Return the value of a name such as ``a.b[1]``. Raises `UsageError` if it has none."""
+    """Return the value of a name such as ``a.b[1]`` in ``values``. Raises `UsageError` if there is none."""
     value: Any = values
     for part in _PART.findall(name):
         try:
@@ -383,24 +383,24 @@ def _above(path: str) -> Iterator[str]:
 
 
 def _needed_stages(
-    stages: Mapping[str, ChainStage], after: Mapping[str, frozenset[str]], names: Sequence[str], file: Path
+    stages: Mapping[str, ChainStage], dependencies: Mapping[str, frozenset[str]], names: Sequence[str], file: Path
 ) -> set[str]:
-    """Return ``names``, which are stages or groups, and all stages that they depend on; all stages without ``names``.
+    """Return the stages that must run for ``names``, which are stages or groups, or all stages if there are no names.
 
-    Raises `UsageError` for an unknown name. ``after`` contains the dependencies of each stage.
+    ``dependencies`` contains the stages that each stage depends on. Raises `UsageError` for an unknown name.
     """
     if not names:
         return set(stages)
     needed: set[str] = set()
     for name in names:
-        chosen = {stage.name for stage in stages.values() if name in (stage.name, stage.group)}
-        if not chosen:
+        matching = {stage.name for stage in stages.values() if name in (stage.name, stage.group)}
+        if not matching:
             groups = dict.fromkeys(stage.group for stage in stages.values())
             raise UsageError(f"{file} has no stage {plain(name)}; it has {listed(groups, _SHOWN)}.")
-        needed |= chosen
+        needed |= matching
     unvisited = list(needed)
     while unvisited:
-        new = after[unvisited.pop()] - needed
-        needed |= new
-        unvisited += new
+        unseen = dependencies[unvisited.pop()] - needed
+        needed |= unseen
+        unvisited += unseen
     return needed

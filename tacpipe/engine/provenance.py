@@ -96,7 +96,7 @@ def usable_cores() -> int:
 
 @functools.cache
 def _processor() -> Processor:
-    """Return the model of the first core and its instruction sets among `_INSTRUCTIONS`."""
+    """Return the model of the first core, and those of `_INSTRUCTIONS` that it supports."""
     values: dict[str, str] = {}  # values for the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
@@ -107,10 +107,10 @@ def _processor() -> Processor:
                 values[name.strip().lower()] = value.strip()
     except OSError:  # macOS
         pass
-    words = set(f"{values.get('flags', '')} {values.get('features', '')}".split())
+    flags = set(f"{values.get('flags', '')} {values.get('features', '')}".split())
     return {
         "model": values.get("model name") or platform.processor() or platform.machine(),
-        "instructions": [name for name in _INSTRUCTIONS if name in words],
+        "instructions": [name for name in _INSTRUCTIONS if name in flags],
     }
 
 

@@ -91,7 +91,7 @@ def part(
 ) -> dict[str, pa.Table]:
     """Return the tables that describe one recording.
 
-    ``losses`` are known losses of the format, ``carried`` the columns that it represents (None for all). Each column in
+    ``losses`` are known losses of the format, ``carried`` the columns that it contains (None for all). A column that is in
     neither becomes a loss.
     """
     import numpy as np

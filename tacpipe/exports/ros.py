@@ -244,7 +244,7 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
 
 
 def derived_topic(stream: str, name: str, kind: str, t_ns: Int64s, parts: Sequence[Part]) -> Topic:
-    """Return a topic below that of a stream, whose messages begin with a stamp and the name of the frame."""
+    """Return the topic ``name`` below the topic of a stream. Its messages begin with a header of stamp and frame name."""
     top = f"/{topic_part(stream_label(stream))}"
     values = [*header_parts(t_ns, stream_label(stream)), *parts]
     return Topic(

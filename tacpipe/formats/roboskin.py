@@ -286,13 +286,13 @@ def lag_one(values: AnyArray, axis: int) -> float:
     """
     import numpy as np
 
-    moved = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
-    first, second = moved[:-1].ravel(), moved[1:].ravel()
-    if not first.size or not np.isfinite(moved).all():
+    series = np.moveaxis(np.asarray(values, dtype=np.float64), axis, 0)
+    earlier, later = series[:-1].ravel(), series[1:].ravel()
+    if not earlier.size or not np.isfinite(series).all():
         return float("nan")
-    before, after = first - first.mean(), second - second.mean()
-    spread = float(np.sqrt((before @ before) * (after @ after)))
-    return float(before @ after) / spread if spread > 0 else float("nan")
+    earlier, later = earlier - earlier.mean(), later - later.mean()
+    spread = float(np.sqrt((earlier @ earlier) * (later @ later)))
+    return float(earlier @ later) / spread if spread > 0 else float("nan")
 
 
 def is_time(values: AnyArray, axis: int, lowest: float = MIN_AUTOCORRELATION) -> bool:

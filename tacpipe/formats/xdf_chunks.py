@@ -140,14 +140,17 @@ def _parse_regular(
 
 def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> ChunkSamples:
     """Return the samples before the first incomplete one, parsed one by one."""
-    stamps, values, offset, size = [], [], 0, channels * kind.itemsize
+    stamps, values, start, size = [], [], 0, channels * kind.itemsize
     for _ in range(count):
-        stamp = _read_stamp(body, offset)
-        if stamp is None or stamp[1] + size > len(body):
+        stamp_and_end = _read_stamp(body, start)
+        if stamp_and_end is None:
             break
-        stamps.append(stamp[0])
-        values.append(body[stamp[1] : stamp[1] + size])
-        offset = stamp[1] + size
+        stamp, end = stamp_and_end
+        if end + size > len(body):
+            break
+        stamps.append(stamp)
+        values.append(body[end : end + size])
+        start = end + size
     table = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
     return ChunkSamples(np.array(stamps, dtype=np.float64), table, count - len(stamps))
 

@@ -112,13 +112,13 @@ class TrialMeta:
         return self._read(name, {"0": False, "1": True, "0.0": False, "1.0": True}.__getitem__, "0 or 1")
 
     def utc_ns(self, name: str) -> int:
-        """Return a time such as ``2021-11-24 15:20:42.172409``, read as UTC, in nanoseconds since 1970."""
+        """Return the value of a field such as ``2021-11-24 15:20:42.172409``, in UTC, in nanoseconds since 1970."""
 
-        def moment(cell: str) -> int:
-            since = datetime.fromisoformat(cell).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-            return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1_000
+        def parse_time(cell: str) -> int:
+            elapsed = datetime.fromisoformat(cell).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+            return (elapsed.days * 86_400 + elapsed.seconds) * 1_000_000_000 + elapsed.microseconds * 1_000
 
-        return self._read(name, moment, "a date and time as 2021-11-24 15:20:42.172409")
+        return self._read(name, parse_time, "a date and time as 2021-11-24 15:20:42.172409")
 
     def _read(self, name: str, read: Callable[[str], T], expected: str) -> T:
         """Return ``read`` of a cell. Raises `TacpipeError` if the cell is missing or ``read`` fails."""

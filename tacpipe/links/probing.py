@@ -104,12 +104,12 @@ def recognise(data: Chunks, scheme: str, sensors: Iterable[SensorCandidate] | No
     shuffled, noise = _shuffle(sample), _noise(sample)
     findings = []
     for candidate in candidates(sample, scheme) if sensors is None else sensors:
-        frames, part, rate_hz = _count_frames(candidate.sensor, sample)
-        if frames < MIN_FRAMES or part < POSSIBLE:
+        frames, explained, rate_hz = _count_frames(candidate.sensor, sample)
+        if frames < MIN_FRAMES or explained < POSSIBLE:
             continue
         # Shuffled digits are still lines of numbers, so sensors that are described by the bytes use random bytes.
         _, chance, _ = _count_frames(candidate.sensor, noise if candidate.sensor.described else shuffled)
-        finding = Finding(candidate, frames, rate_hz, len(sample.data), part, chance)
+        finding = Finding(candidate, frames, rate_hz, len(sample.data), explained, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
             findings.append(finding)
     return sorted(findings, key=_rank)

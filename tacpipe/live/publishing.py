@@ -174,9 +174,9 @@ class LslPublisher:
             name, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{name}"
         )
         channels = info.desc().append_child("channels")
-        for name, unit in columns:
+        for column, unit in columns:
             channel = channels.append_child("channel")
-            channel.append_child_value("label", name)
+            channel.append_child_value("label", column)
             channel.append_child_value("unit", unit)
         self.dropped = 0
         self._about = about

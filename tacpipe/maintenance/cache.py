@@ -88,7 +88,7 @@ def verify(store: CachedStore) -> Soundness:
 
 
 def repair_damaged(store: CachedStore) -> Soundness:
-    """Return the soundness of the bucket after replacing damaged and missing objects.
+    """Replace damaged and missing objects of the bucket, and return its soundness.
 
     A damaged object is moved to quarantine in the bucket. It is restored from the local cache, from a dataset's
     directory, or by recomputing it; objects that this computer cannot restore are reported as lost. A damaged record

@@ -32,22 +32,24 @@ def roots(store: AnyStore) -> list[Root]:
 
 
 def labels(all_roots: Iterable[Root]) -> dict[tuple[str, str], str]:
-    """Return how each of the pushed roots of a store is named, by its project's id and its path.
+    """Return a label for each pushed root, by its project's id and its path: the project's name or id, and the path.
 
-    >>> one, two = ({"id": digit * 32, "name": "exp"} for digit in "ab")
-    >>> list(labels([{"path": "rec", "project": one}]).values())
+    >>> first, second = ({"id": digit * 32, "name": "exp"} for digit in "ab")
+    >>> list(labels([{"path": "rec", "project": first}]).values())
     ['exp:rec']
-    >>> list(labels([{"path": "rec", "project": one}, {"path": "rec", "project": two}]).values())
+    >>> list(labels([{"path": "rec", "project": first}, {"path": "rec", "project": second}]).values())
     ['aaaaaaaa:rec', 'bbbbbbbb:rec']
     """
     pushed_roots = list(all_roots)
-    ids = {project_id(root): root["project"]["name"] if "project" in root else "" for root in pushed_roots}
-    shared = Counter(ids.values())
-    names = {
-        identifier: identifier[:_SHOWN_DIGITS] if shared[name] > 1 or ":" in name else name
-        for identifier, name in ids.items()
-    }
-    return {(project_id(root), root["path"]): f"{names[project_id(root)]}:{root['path']}" for root in pushed_roots}
+    names = {project_id(root): root["project"]["name"] if "project" in root else "" for root in pushed_roots}
+    counts = Counter(names.values())
+    labels_by_key = {}
+    for root in pushed_roots:
+        identifier, path = project_id(root), root["path"]
+        name = names[identifier]
+        is_ambiguous = counts[name] > 1 or ":" in name
+        labels_by_key[identifier, path] = f"{identifier[:_SHOWN_DIGITS] if is_ambiguous else name}:{path}"
+    return labels_by_key
 
 
 def label(root: Root, all_roots: Iterable[Root]) -> str:

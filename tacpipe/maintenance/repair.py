@@ -98,7 +98,7 @@ class Soundness:
             self.lost[name] = str(error)
 
     def to_text(self, *, changed: bool = True) -> str:
-        """Return the findings as text. ``changed``: whether damaged files were moved to quarantine."""
+        """Return the findings as text. ``changed`` is whether damaged files were moved to quarantine."""
         if not self.there:
             return "there is no store yet, so there is nothing to read"
         lines = [f"{self.objects} objects and {self.records} records read"]

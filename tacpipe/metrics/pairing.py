@@ -302,10 +302,10 @@ def _repeat_index(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
     by_recording: dict[str, set[Hashable]] = {}
     for seed, recording in keys:
         by_recording.setdefault(recording, set()).add(seed)
-    groups: list[set[Hashable]] = []
+    groups: list[set[Hashable]] = []  # disjoint sets of seeds that share recordings
     for seeds in {frozenset(seeds) for seeds in by_recording.values()}:
-        joined = [group for group in groups if group & seeds]
-        groups = [group for group in groups if not group & seeds] + [set(seeds).union(*joined)]
+        overlapping = [group for group in groups if group & seeds]
+        groups = [group for group in groups if not group & seeds] + [set(seeds).union(*overlapping)]
     order = {seed: index for index, seed in enumerate(dict.fromkeys(seed for seed, _ in keys))}
     repeats: dict[Hashable, int] = {}
     for group in groups:

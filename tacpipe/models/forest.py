@@ -43,18 +43,18 @@ class Forest:
 
         forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
         forest.fit(rows.astype(np.float32), values if values.shape[1] > 1 else values[:, 0])
-        trees_fitted = [tree.tree_ for tree in forest.estimators_]
-        starts = np.cumsum([0, *(tree.node_count for tree in trees_fitted)])[:-1]
-        children = [
-            np.where((pair := np.column_stack([tree.children_left, tree.children_right])) == LEAF, LEAF, pair + start)
-            for tree, start in zip(trees_fitted, starts, strict=True)
-        ]
+        fitted_trees = [tree.tree_ for tree in forest.estimators_]
+        starts = np.cumsum([0, *(tree.node_count for tree in fitted_trees)])[:-1]
+        children = []
+        for tree, start in zip(fitted_trees, starts, strict=True):
+            pairs = np.column_stack([tree.children_left, tree.children_right])
+            children.append(np.where(pairs == LEAF, LEAF, pairs + start))
         return cls(
             starts.astype(np.int32),
             np.concatenate(children).astype(np.int32),
-            np.concatenate([np.maximum(tree.feature, 0) for tree in trees_fitted]).astype(np.int32),
-            np.concatenate([tree.threshold for tree in trees_fitted]),
-            np.concatenate([tree.value[:, :, 0] for tree in trees_fitted]).astype(np.float32),
+            np.concatenate([np.maximum(tree.feature, 0) for tree in fitted_trees]).astype(np.int32),
+            np.concatenate([tree.threshold for tree in fitted_trees]),
+            np.concatenate([tree.value[:, :, 0] for tree in fitted_trees]).astype(np.float32),
         )
 
     @staticmethod

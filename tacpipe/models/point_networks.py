@@ -86,14 +86,14 @@ class LargestOverPoints(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the gradients of points, weight and bias; that of points is nonzero only at the maxima."""
+        """Return the gradients of points, weight and bias. The gradient of points is nonzero only at the maxima."""
         points, weight, indices = ctx.saved_tensors
         (gradient,) = gradients
-        at = (indices + torch.arange(len(indices), device=indices.device)[:, None] * points.shape[1]).ravel()
+        maximum_rows = (indices + torch.arange(len(indices), device=indices.device)[:, None] * points.shape[1]).ravel()
         rows = points.reshape(-1, points.shape[2])  # (cloud and point, input)
         to_points = torch.zeros_like(rows)
-        to_points.index_add_(0, at, (gradient[:, :, None] * weight).view(len(at), -1))
-        to_weight = _weighted_sum(gradient, rows.index_select(0, at).view(*indices.shape, -1))
+        to_points.index_add_(0, maximum_rows, (gradient[:, :, None] * weight).view(len(maximum_rows), -1))
+        to_weight = _weighted_sum(gradient, rows.index_select(0, maximum_rows).view(*indices.shape, -1))
         return to_points.view_as(points), to_weight, gradient.sum(dim=0)
 
 

@@ -125,18 +125,19 @@ class Spool:
     """A spool that is being written. One thread appends; the threads that read links call `tally` for their streams."""
 
     def __init__(self, store: Path, header: spool_folders.RecordingHeader, streams: Sequence[str]) -> None:
+        """Create the folder of a spool in ``store``, with its header, and lock it."""
         self.folder = store / spool_folders.FOLDER / uuid.uuid4().hex
-        self.streams = {name: number for number, name in enumerate(streams)}
+        self.streams = {name: index for index, name in enumerate(streams)}
         self.clock = read_clocks()
         spool_folders.refuse_link(store)
         with readable_errors(store):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             self.folder.mkdir(mode=0o700)
-            entry: spool_folders.SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
+            spool_header: spool_folders.SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # no other process recovers a locked spool
             self._tally = _create_tally(self.folder, len(streams))
-            content = json.dumps(entry, sort_keys=True).encode()
+            content = json.dumps(spool_header, sort_keys=True).encode()
             write_whole(str(self.folder / "header.json"), content, str(self.folder / ".header.json"))
             for folder in (self.folder, self.folder.parent):
                 sync_folder(str(folder))

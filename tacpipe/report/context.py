@@ -160,9 +160,9 @@ def provenance_blocks(manifest: ManifestJson) -> list[Block]:
 def loss_chart(
     runs: Mapping[str, Sequence[Sequence[float]]], quantity: str, order: Sequence[str] = (), *, log: bool = False
 ) -> Spec:
-    """Return a thin line per run with one value per epoch, and the mean over the runs of each name.
+    """Return a chart with a thin line per run, which has one value per epoch, and the mean over the runs of each name.
 
-    The mean ends with the shortest of its runs. NaN breaks a line.
+    The mean ends with the shortest run. NaN breaks a line.
     """
     lines = []
     for name, curves in runs.items():
@@ -171,8 +171,10 @@ def loss_chart(
         length = min(map(len, curves))
         mean = np.mean([curve[:length] for curve in curves], axis=0)
         lines.append(Curve(name, range(1, length + 1), mean))
-    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value does not make a line
-    return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
+    is_single_epoch = all(
+        len(curve) < 2 for curves in runs.values() for curve in curves
+    )  # a single value does not make a line
+    return charts.lines(lines, "epoch", quantity, order=order, log=log, points=is_single_epoch)
 
 
 def read_coverage(results: Sequence[Dataset]) -> pd.DataFrame | None:

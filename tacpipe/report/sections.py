@@ -56,9 +56,14 @@ def metric_folds(result: Dataset, number: int, count: int) -> list[Fold]:
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
     rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
     headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
-    first = [table("Model and best baseline", *headline.table(headlines))] if headlines else []
+    headline_blocks = [table("Model and best baseline", *headline.table(headlines))] if headlines else []
     title = f"{f'{number}. ' if count > 1 else ''}{name.replace('_', ' ')}"
-    return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
+    return [
+        Fold(
+            title,
+            [*headline_blocks, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)],
+        )
+    ]
 
 
 def leaves(tree: JsonObject) -> dict[str, str]:

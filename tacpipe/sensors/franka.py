@@ -131,7 +131,7 @@ class Franka(Sensor):
         )
 
     def encode(self, samples: Samples) -> Bytes:
-        """Return states with these samples and zeros in all other fields. The pose has float32 precision."""
+        """Return states with the values of ``samples``, and zeros in all other fields. The pose has float32 precision."""
         floats, success_rate, modes, errors = samples.values
         assert samples.seq is not None
         states = np.zeros(len(samples), STATE)
@@ -144,10 +144,10 @@ class Franka(Sensor):
             states[name] = floats[:, column : column + FLOATS[name]]
             column += FLOATS[name]
         states["success_rate"] = success_rate[:, 0]
-        for number, name in enumerate(MODES):
-            states[name] = modes[:, number]
-        for number, name in enumerate(ERRORS):
-            states[name] = errors[:, number : number + 1] >> np.arange(FLAGS, dtype=np.uint64) & np.uint64(1)
+        for index, name in enumerate(MODES):
+            states[name] = modes[:, index]
+        for index, name in enumerate(ERRORS):
+            states[name] = errors[:, index : index + 1] >> np.arange(FLAGS, dtype=np.uint64) & np.uint64(1)
         return states.view(np.uint8).reshape(len(samples), STATE.itemsize)
 
     def opening(self, local: LocalAddress) -> Dialogue:

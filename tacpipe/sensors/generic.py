@@ -85,7 +85,7 @@ class Generic(layout.DescribedSensor):
             raise UsageError(f"generic: two channels are named {repeated}; give the numbers other names.")
 
     def _check_roles(self) -> None:
-        """Raise `UsageError` unless sum, sequence, clock and length each have their own number of a suitable type."""
+        """Raise `UsageError` unless sum, sequence, clock and length are different numbers of suitable types."""
         roles = [role for role in (self.sum, self.sequence, self.clock, self.length) if role is not None]
         numbers = [role.number for role in roles]
         if repeated := next((name for name in numbers if numbers.count(name) > 1), None):

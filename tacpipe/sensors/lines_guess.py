@@ -186,7 +186,7 @@ def _split_cells(lines: Sequence[str]) -> _CellLayout | None:
 
 def _common_prefix(lines: Sequence[str]) -> str:
     """Return the text before the first number of most lines, or "" if they have no common prefix."""
-    prefixes = Counter(match[0] for line in lines if (match := PREFIX.match(line)))
+    prefixes = Counter(match[0] for match in map(PREFIX.match, lines) if match)
     if not prefixes:
         return ""
     prefix, count = prefixes.most_common(1)[0]
@@ -241,9 +241,8 @@ def _names(
     candidates = [list(labels)] if any(labels) else []
     for line in lines:
         words = line.removeprefix(prefix).removesuffix(suffix).split(separator if separator != " " else None)
-        candidates += (
-            [words] if len(words) == width and not any(NUMBER.fullmatch(word.strip()) for word in words) else []
-        )
+        if len(words) == width and not any(NUMBER.fullmatch(word.strip()) for word in words):
+            candidates.append(words)
     for words in candidates:
         names = [re.sub(r"[^a-z0-9]+", "_", word.strip().lower()).strip("_") for word in words]
         if all(NAME.fullmatch(name) for name in names) and len(set(names)) == width:

@@ -85,7 +85,7 @@ class Pattern:
     fixed_text: bytes  # the text without its numbers, and `TEXT_END`
 
     def extract(self, texts: Sequence[bytes]) -> pa.Array | None:
-        """Return the texts of the numbers (text × number,), or None if a text has another pattern.
+        """Return the texts of the numbers (text × number,), or None if a text does not have this pattern.
 
         The returned texts are between the right marks, but may not be numbers.
         """

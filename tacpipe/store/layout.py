@@ -118,7 +118,7 @@ def names(root: Path, folder: str) -> Iterator[str]:
 
 
 def foreign(root: Path) -> list[str]:
-    """Return the sorted paths in the store that do not belong to it, including symbolic links."""
+    """Return the sorted relative paths below ``root`` that do not belong to a store, including symbolic links."""
     paths = [path for name in _FORMS for path, is_ours in _contents(root, name) if not is_ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
     paths += [entry.path for entry in _scan(root, root) if entry.name not in expected]

@@ -106,7 +106,7 @@ def read_note(store: Store, directory: Path) -> Note | None:
 
 
 def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple[State | None, bytes]]) -> None:
-    """Write a note atomically, without syncing it. ``shelves`` contains the state and the rows of each shelf."""
+    """Write the note on ``directory`` atomically, without syncing it. ``shelves`` has the state and rows of each shelf."""
     shelf_index, begin = {}, 0
     for shelf, (state, content) in sorted(shelves.items()):
         shelf_index[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()

@@ -179,10 +179,8 @@ class Store:
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
         """Return the sizes in bytes of the objects that exist."""
-        stored = (name for name in names if self._exists(name))
-        return {
-            name: entry.bytes for name in stored if (entry := self.files.stat(layout.object_name(name))) is not None
-        }
+        entries = {name: self.files.stat(layout.object_name(name)) for name in names if self._exists(name)}
+        return {name: entry.bytes for name, entry in entries.items() if entry is not None}
 
     def room(self) -> int | None:
         """Return the free space on the disk in bytes, or None if it is unknown."""
@@ -237,7 +235,7 @@ class Store:
         self.write_file(self.object_path(name), blocks, mode=0o444)
 
     def settle(self, names: Iterable[str]) -> None:
-        """Make names in the store survive a power loss, as their contents do; each folder is synced once."""
+        """Sync the folders of files in the store, so that their names survive a power loss. Contents are synced already."""
         folders = {str(folder) for name in names for folder in Path(name).parents}
         with readable_errors(self.root):
             for folder in sorted(folders, reverse=True):  # subfolders first

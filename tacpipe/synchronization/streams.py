@@ -280,14 +280,14 @@ def unwrap_counts(stream: TimedStream) -> TimedStream:
 
 
 def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
-    """Return the wraps of the channels that have any. Channels with empty rows have none."""
+    """Return the counter wraps of each channel that has any. Channels with empty rows are not checked."""
     import numpy as np
 
     from tacpipe.arrays import from_arrow, is_numeric
     from tacpipe.signals.repairs import HALF, count_wraps
 
     steps: dict[str, list[tuple[Int64s, Int32s]]] = {name: [] for name in names}
-    last: dict[str, int] = {}  # count in the row before a batch
+    last_counts: dict[str, int] = {}  # count in the row before a batch
     first = 0
     for batch in columns.batches(names):
         for name in list(steps):
@@ -295,22 +295,22 @@ def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
                 del steps[name]
                 continue
             counts = from_arrow(column)
-            before, last[name] = last.get(name, int(counts[0])), int(counts[-1])
+            before, last_counts[name] = last_counts.get(name, int(counts[0])), int(counts[-1])
             if max(before, int(counts.max())) - min(before, int(counts.min())) > HALF:
-                turned = count_wraps(np.concatenate([[before], counts]).astype(np.int32))
-                rows = np.flatnonzero(turned)
-                steps[name].append((first + rows, turned[rows]))
+                turns = count_wraps(np.concatenate([[before], counts]).astype(np.int32))
+                rows = np.flatnonzero(turns)
+                steps[name].append((first + rows, turns[rows]))
         first += batch.num_rows
     wraps = {}
-    for name, parts in steps.items():
-        if parts and sum(len(rows) for rows, _ in parts):
-            rows, turned = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-            wraps[name] = Wraps(rows, np.cumsum(np.append(0, turned), dtype=np.int32))
+    for name, blocks in steps.items():
+        if blocks and sum(len(rows) for rows, _ in blocks):
+            rows, turns = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
+            wraps[name] = Wraps(rows, np.cumsum(np.append(0, turns), dtype=np.int32))
     return wraps
 
 
 def _repeated_rows(columns: Columns, storage: MappedArrays) -> Bools:
-    """Return a mask (time,) of rows that repeat the previous row in all channels but labels, which are often constant."""
+    """Return a mask (time,) of rows that repeat the previous row in all channels except labels, which are often constant."""
     from tacpipe.arrays import from_arrow
 
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
@@ -318,14 +318,14 @@ def _repeated_rows(columns: Columns, storage: MappedArrays) -> Bools:
     repeated[:] = bool(names)
     repeated[:1] = False
     for name in names:
-        first, last, repeats = 0, None, False
+        first, previous, repeats = 0, None, False
         for batch in columns.batches([name]):
             values = from_arrow(batch.column(name))
             mask = repeated[first : first + len(values)]
-            mask[:1] &= first > 0 and values[0] == last
+            mask[:1] &= first > 0 and values[0] == previous
             mask[1:] &= values[1:] == values[:-1]
             repeats = repeats or bool(mask.any())
-            first, last = first + len(values), values[-1]
+            first, previous = first + len(values), values[-1]
             storage.read(mask.nbytes)
         if not repeats:
             break

@@ -113,9 +113,9 @@ _GEOMETRY = _geometry_meanings()
 
 
 def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
-    """Return a value's name, quantity, unit and component, and the path length of the type that defines them.
+    """Return a value's name, quantity, unit and component, and the length of the path of the message that defines them.
 
-    Returns None if no enclosing type defines the value.
+    Returns None if no enclosing message has a type that defines the value.
     """
     for depth, kind in reversed(leaf.enclosing):
         meaning = _GEOMETRY.get((kind, leaf.path[depth:]))

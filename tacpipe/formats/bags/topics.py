@@ -343,10 +343,10 @@ def flatten_object(nested: Values, prefix: str = "") -> dict[str, Leaf]:
         value = {str(position): element for position, element in enumerate(entry)} if is_list else entry
         if not isinstance(value, dict):
             values[path] = value
-        elif set(value) in ({"sec", "nsec"}, {"sec", "nanosec"}) and all(
-            isinstance(part, int) for part in value.values()
-        ):
-            values[path] = value["sec"] * 10**9 + next(part for key, part in value.items() if key != "sec")
+            continue
+        is_time = set(value) in ({"sec", "nsec"}, {"sec", "nanosec"})
+        if is_time and all(isinstance(number, int) for number in value.values()):
+            values[path] = value["sec"] * 10**9 + value["nsec" if "nsec" in value else "nanosec"]
         else:
             values |= flatten_object(value, f"{path}.")
     return values

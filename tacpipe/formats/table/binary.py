@@ -122,9 +122,9 @@ class NumpyArchive:
         return self._arrays
 
     def frames(self, array: str, clock: str) -> SourceStream:
-        """Return the images of an array as a column of raw pixels, with the array ``clock`` of timestamps if it is given.
+        """Return a stream of the images in ``array`` as raw pixels, with the timestamps in the array ``clock``, if any.
 
-        Raises `TacpipeError` if the file lacks an array, or the array is no images.
+        Raises `TacpipeError` if the file lacks an array, or ``array`` does not contain images.
         """
         names = [array, *([clock] if clock else [])]
         missing = [name for name in names if name not in self._arrays]

@@ -265,20 +265,20 @@ def meaning_from_name(name: str, kind: str) -> ColumnMeaning:
 
 
 def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
-    """Return the column meanings of an ALOHA array: arms of six joints and a gripper that is open at 1; None for others.
+    """Return the column meanings of an ALOHA array, or None for another array.
 
-    ``effort`` is the motor current in a unit of ALOHA's own.
+    Each arm has six joints and a gripper, which is open at 1. ``effort`` is the motor current in ALOHA's own unit.
 
     >>> [meaning.quantity for meaning in aloha_meanings("observations/qpos", 14)][5:8]
     ['joint_position', 'state', 'joint_position']
     """
-    last = name.rpartition("/")[2]
+    array_name = name.rpartition("/")[2]
     quantities = {"qpos": ("joint_position", "rad"), "qvel": ("joint_velocity", "rad/s"), "effort": ("current", "")}
     quantities["action"] = ("target_joint_position", "rad")
-    if last not in quantities or width % 7:
+    if array_name not in quantities or width % 7:
         return None
-    joint = ColumnMeaning(*quantities[last])
-    gripper = joint if last == "effort" else ColumnMeaning("state", "1" if last != "qvel" else "1/s")
+    joint = ColumnMeaning(*quantities[array_name])
+    gripper = joint if array_name == "effort" else ColumnMeaning("state", "1" if array_name != "qvel" else "1/s")
     return ([joint] * 6 + [gripper]) * (width // 7)
 
 

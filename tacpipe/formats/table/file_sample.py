@@ -356,15 +356,15 @@ def time_column(sample: FileSample) -> str | None:
     increasing = [
         name for name in sample.names if increases(sample.values[name]) and not label_table.RECORDING.fullmatch(name)
     ]
-    timestamp_like = {
+    candidates = [
         name
         for name in sample.names
         if name in increasing
         or any(isinstance(value, str | datetime.datetime | datetime.time) for value in sample.values[name])
-    }
+    ]
     for time_name in (column_names.TIME_NAME, column_names.TIME_ENDING):
-        for name in sample.names:
-            if name in timestamp_like and time_name.fullmatch(column_names.without_unit(name)):
+        for name in candidates:
+            if time_name.fullmatch(column_names.without_unit(name)):
                 return name
     return increasing[0] if increasing and increasing[0] == sample.names[0] else None
 

@@ -235,9 +235,10 @@ def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
 
 
 def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
-    """Yield the place and the labels of each entry of a mapping of names to labels, or of a list of labels.
+    """Yield the position and the labels of each entry of a JSON or YAML file.
 
-    Raises `TacpipeError` if the file is neither, or an entry is not a mapping.
+    The file contains a mapping of names to labels, or a list of labels. Raises `TacpipeError` if it contains neither, or if
+    an entry is not a mapping.
     """
     text = read_text(path)
     try:

@@ -63,7 +63,7 @@ def _read_single_row(path: Path) -> dict[str, Attribute]:
 
 
 def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attribute]]:
-    """Return the rows of a label table by key; the keys of a YAML or JSON mapping are its names.
+    """Return the labels in a label table by the value of its key column, or by name for a YAML or JSON mapping.
 
     Raises `TacpipeError` for a missing key column and for repeated keys.
     """

@@ -301,9 +301,9 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
 
 
 def _rows(curve: Curve, number: int) -> list[DataRow]:
-    """Return the points of the curve with this ``number`` as rows, fewer if it has no band."""
-    x, y = (np.asarray(part, np.float64) for part in (curve.x, curve.y))
-    low, high = (None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high))
+    """Return the points of a curve as rows, fewer if it has no band. ``number`` distinguishes curves of the same name."""
+    x, y = (np.asarray(values, np.float64) for values in (curve.x, curve.y))
+    low, high = (None if values is None else np.asarray(values, np.float64) for values in (curve.low, curve.high))
     if low is None:
         x, y = decimated(x, y)
     rows: list[DataRow] = []

@@ -207,14 +207,14 @@ class Harm:
 
         In packets, only those of the first frame are replaced. Changes ``items``.
         """
-        first, remaining = start, count
-        for number in range(row, row + 1 if self.packets else len(items)):
-            data = items[number].data
-            size = min(remaining, len(data) - first)
+        offset, remaining = start, count
+        for index in range(row, row + 1 if self.packets else len(items)):
+            data = items[index].data
+            size = min(remaining, len(data) - offset)
             if size > 0:
                 random = self._rng.integers(0, 256, size, dtype=np.uint8).tobytes()
-                items[number] = items[number]._replace(data=data[:first] + random + data[first + size :], cause=BURST)
-            first, remaining = 0, remaining - size
+                items[index] = items[index]._replace(data=data[:offset] + random + data[offset + size :], cause=BURST)
+            offset, remaining = 0, remaining - size
             if remaining <= 0:
                 break
 

@@ -125,7 +125,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     evaluated = {}
     key = classifier.naming.key
     attributes = {name: recording.attributes for name, recording in recordings.recordings.items()}
-    answers = Answers(classifier, {name: headlines.label_text(own.get(key, "")) for name, own in attributes.items()})
+    answers = Answers(
+        classifier, {name: headlines.label_text(labels.get(key, "")) for name, labels in attributes.items()}
+    )
     with terminal.progress_bar("evaluate", 2 * len(recordings.recordings)) as advance:  # read, then classify
         for sensor, slides in _read_slides(classifier, recordings, advance).items():
             is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
@@ -160,7 +162,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    table = predictions_table(evaluated, classifier, {name: own.get("session") for name, own in attributes.items()})
+    table = predictions_table(
+        evaluated, classifier, {name: labels.get("session") for name, labels in attributes.items()}
+    )
     return Result({PREDICTIONS: RecordingOutput(table, selection.combine_origins(attributes.values()))}, files)
 
 
@@ -270,15 +274,12 @@ def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> li
     sensor_headlines = []
     for sensor, result in evaluated.items():
         mask = ~result.in_training & result.counted & ~result.held_out
-        names = np.array(result.slides.names)[mask]
-        right = {
-            predictor: {
-                (0, str(name)): (int(correct), 1)
-                for name, correct in zip(names, result.is_right(predictor, mask), strict=True)
-            }
-            for predictor in result.predicted
-        }
-        sensor_headline = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
+        keys = [(0, str(name)) for name in np.array(result.slides.names)[mask]]
+        counts = {}  # correct slides and slides (0 or 1, 1) by predictor and slide
+        for predictor in result.predicted:
+            is_right = result.is_right(predictor, mask)
+            counts[predictor] = {key: (int(right), 1) for key, right in zip(keys, is_right, strict=True)}
+        sensor_headline = headlines.headline(classifier.config["architecture"], sensor, counts, len(classifier.classes))
         sensor_headlines += [sensor_headline] if sensor_headline else []
     return sensor_headlines
 

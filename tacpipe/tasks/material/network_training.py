@@ -196,26 +196,26 @@ def _scaled_slides(
     params: NetworkParams,
     config: MaterialConfig,
     slides: Slides,
-    scaled: Affine,
+    scaling: Affine,
     held_out_materials: Mapping[str, set[int]],
     device: str,
-    index: int,
+    sensor_index: int,
 ) -> ScaledSlides:
-    """Return slides as network input; held-out classes and classes without training slides have no label.
+    """Return slides as network input. Slides of held-out classes and of classes without training slides have no label.
 
     Raises `TacpipeError` if no label is left.
     """
     name = slides.layout.sensor
-    numbers = {
-        material: number
-        for number, material in enumerate(config["classes"])
+    index_by_material = {
+        material: class_index
+        for class_index, material in enumerate(config["classes"])
         if material not in held_out_materials[name]
     }
-    materials = readouts.permute_labels(params, slides.materials, index)
-    classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
+    materials = readouts.permute_labels(params, slides.materials, sensor_index)
+    classes = torch.tensor([index_by_material.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
-    return ScaledSlides(torch.from_numpy(scaled.apply(slides.frames)).to(device), classes.to(device))
+    return ScaledSlides(torch.from_numpy(scaling.apply(slides.frames)).to(device), classes.to(device))
 
 
 def _require_same_materials(training_slides: BySensor, naming: Naming) -> None:

@@ -187,7 +187,7 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
 def _stack_slides(
     sensor_slides: Sequence[tuple[Recording, SlideLayout, Float32s]], naming: Naming, labelled: bool
 ) -> Slides:
-    """Return the slides of one sensor. Raises `TacpipeError` if their layouts are not compatible, or as `_material`."""
+    """Return the slides of one sensor. Raises `TacpipeError` for incompatible layouts, and the errors of `_material`."""
     first, layout, _ = sensor_slides[0]
     for shard, compared, _ in sensor_slides:
         if not layout.is_compatible(compared):

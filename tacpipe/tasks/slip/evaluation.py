@@ -173,21 +173,17 @@ class EvaluatedSlips:
 
     def to_table(self) -> pa.Table:
         """Return the table of all windows."""
-
-        def column(values: Sequence[Any]) -> Any:
-            return np.concatenate(values)
-
         sizes = [len(track.t_ns) for track in self.tracks]
         table = {
             "recording": pa.array(np.repeat([track.name for track in self.tracks], sizes)),
             "object": pa.array(np.repeat([track.object for track in self.tracks], sizes)),
-            "t_ns": pa.array(column([track.t_ns for track in self.tracks]), pa.int64()),
-            "since_s": pa.array(column([track.since_s for track in self.tracks])),
-            "state": pa.array(column([track.states for track in self.tracks]), pa.int8()),
+            "t_ns": pa.array(np.concatenate([track.t_ns for track in self.tracks]), pa.int64()),
+            "since_s": pa.array(np.concatenate([track.since_s for track in self.tracks])),
+            "state": pa.array(np.concatenate([track.states for track in self.tracks]), pa.int8()),
         }
         for name in self.scores:
-            table[f"score_{name}"] = pa.array(column(self.scores[name]))
-            table[f"probability_{name}"] = pa.array(column(self.probabilities[name]))
+            table[f"score_{name}"] = pa.array(np.concatenate(self.scores[name]))
+            table[f"probability_{name}"] = pa.array(np.concatenate(self.probabilities[name]))
         return pa.table(table)
 
     def events_json(self) -> bytes:

@@ -63,7 +63,7 @@ def run_times(t_ns: Times, active: Bools) -> Times:
 
 
 def merge_events(parts: Sequence[Times]) -> Times:
-    """Return the union of intervals (event, 2), those closer than `MERGED_NS` as one."""
+    """Return the union of intervals (event, 2). Intervals less than `MERGED_NS` apart are merged."""
     events: list[list[int]] = []
     for begin, end in sorted(tuple(row) for part in parts for row in part.tolist()):
         if events and begin - events[-1][1] < MERGED_NS:

@@ -96,7 +96,7 @@ def area_table(measured: Mapping[str, Any]) -> Any:
 
 
 def alarm_table(measured: Mapping[str, Any]) -> Any:
-    """Return the table of the model's alarms, one row per rate of false alarms that they were set for."""
+    """Return a table of the model's alarms, with one row per rate of false alarms for which their level was set."""
     rows: list[Sequence[str | Cell]] = []
     for rate, alarm in measured[MODEL]["alarms"].items():
         cells = [

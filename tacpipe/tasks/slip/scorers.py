@@ -217,11 +217,9 @@ def load_baseline(
 
 
 def baseline_columns(reader: FingerReader) -> dict[str, tuple[int, ...]]:
-    """Return the columns that each baseline of boosted trees reads.
+    """Return the feature columns of each baseline of boosted trees. A baseline without existing features is left out.
 
-    They are the time, shear over load or else the level, the total change, and the plan.
-
-    A baseline whose features do not exist is left out.
+    The baselines read the time, shear over load (or else the level), the total change, and the plan.
     """
     names = reader.names
 

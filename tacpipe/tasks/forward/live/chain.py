@@ -334,7 +334,7 @@ class LiveChain:
         return forecasts
 
     def _row(self, rows: GridRows, index: int, t_ns: int) -> _Row:
-        """Return a row of the grid as the model reads it."""
+        """Return the row ``index`` of the grid, in the form that the model reads."""
         gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
         newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
         values = {name: columns[index] for name, columns in rows.values.items()}

@@ -235,11 +235,11 @@ def paper_row(codec: CodecDescription) -> str | None:
 
 
 def _distance(method: Method) -> tuple[int, int, int, str]:
-    """Return a sort key by the distance of a recurrent method from the paper's: kind and number of latents, runs, name."""
+    """Return a sort key for recurrent methods by similarity to the paper's: kind and number of latents, runs, name."""
     codec = codec_of(method)
-    kind = codec["kind"]
-    off = abs(int(codec["latents"]) - _PAPER_WIDTH.get(kind, int(codec["latents"])))
-    return _PREFERRED.index(kind), off, -len(method.runs), method.name
+    kind, latents = codec["kind"], int(codec["latents"])
+    excess_latents = abs(latents - _PAPER_WIDTH.get(kind, latents))
+    return _PREFERRED.index(kind), excess_latents, -len(method.runs), method.name
 
 
 ORACLES = ("codec", "codec_anchored")  # predictors that use the true future

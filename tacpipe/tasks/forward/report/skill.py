@@ -159,7 +159,7 @@ EXPLAINED = (
 
 
 def band_folds(context: Context) -> list[Fold]:
-    """Return the quality of quantiles in results of calibrated models; empty if there are none."""
+    """Return folds on the quality of quantiles of calibrated models, or an empty list if there are none."""
     runs = [run for run in context.runs if COVERAGE_FILE in run.details.dataset.files]
     if not runs:
         return []
@@ -171,10 +171,10 @@ def band_folds(context: Context) -> list[Fold]:
     for method in methods:
         fresh = _fresh_rows([run for run in runs if run.method == method])
         for known_objects in (True, False):
-            part = fresh[fresh.known == known_objects]
-            if len(part):
+            rows_of_part = fresh[fresh.known == known_objects]
+            if len(rows_of_part):
                 title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known_objects])))
-                bands = calibration.measure_bands(part, "step", "unit", BASELINE)
+                bands = calibration.measure_bands(rows_of_part, "step", "unit", BASELINE)
                 drawn.append(_coverage_chart(title, bands, level))
                 rows += _coverage_rows(title, bands)
     heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")

@@ -57,28 +57,28 @@ class MaterialLive(LiveTask):
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> MaterialEngine:
         """Return the engine of a session.
 
-        Raises `UsageError` if the rig's sensor is ambiguous. Raises `TacpipeError` if the rig lacks channels of the
-        model, or one of the model's stages has no causal version.
+        Raises `UsageError` if the rig's sensor is ambiguous, and `TacpipeError` if the rig lacks channels of the model, or
+        one of the model's stages has no causal version.
         """
         from tacpipe.tasks.material.classifier import Classifier
         from tacpipe.tasks.material.live.engine import MaterialEngine, find_finger
         from tacpipe.tasks.material.live.slide import SlideSoFar, slide_params
 
-        own_settings = _material_settings(settings)
+        material_settings = _material_settings(settings)
         classifier = Classifier.load(model.files)
         params = slide_params(model.source.chain)
         trained = tuple(classifier.layouts)
-        if not own_settings.sensor and len(trained) > 1:
+        if not material_settings.sensor and len(trained) > 1:
             raise UsageError(
                 f"The model knows the sensors {listed(trained)}; give --sensor {trained[0]}, or the sensor of the rig."
             )
-        sensor = own_settings.sensor or trained[0]
+        sensor = material_settings.sensor or trained[0]
         finger = find_finger(sensors)
         _check_channels(classifier, sensor, finger, sensors[finger])
-        slide = SlideSoFar(classifier, params, sensor, own_settings.least, sensors[finger].rate_hz)
-        if own_settings.pause_s and slide.ends_by_arm and len(sensors) == 1:
+        slide = SlideSoFar(classifier, params, sensor, material_settings.least, sensors[finger].rate_hz)
+        if material_settings.pause_s and slide.ends_by_arm and len(sensors) == 1:
             raise UsageError(
-                f"--pause-s {own_settings.pause_s:g}: slides of this model end when the arm stops, and the rig has no "
+                f"--pause-s {material_settings.pause_s:g}: slides of this model end when the arm stops, and the rig has no "
                 f"stream but {finger}. Add the arm, or train on `segment slides --trigger load`, whose slides end when "
                 f"nothing is touched."
             )
@@ -89,7 +89,7 @@ class MaterialLive(LiveTask):
             slide.frames,
             slide.any_length,
             "probability" if has_probabilities else "order",
-            1e3 / own_settings.every_ms,
+            1e3 / material_settings.every_ms,
             settings.model,
         )
         return MaterialEngine(
@@ -97,9 +97,9 @@ class MaterialLive(LiveTask):
             finger,
             slide,
             description,
-            every_ns=round(own_settings.every_ms * 1e6),
+            every_ns=round(material_settings.every_ms * 1e6),
             settle_ns=round(settings.settle_ms * 1e6),
-            pause_ns=round(own_settings.pause_s * 1e9),
+            pause_ns=round(material_settings.pause_s * 1e9),
         )
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:

@@ -243,7 +243,7 @@ JOINT, ALONE, OURS = "RAEC joint", "RAEC independent", "MiniRocket"
 
 
 def reduction_tables(methods: Sequence[Method]) -> list[Table]:
-    """Return one table per reduced sensor in the form of the paper; empty if no sensor was reduced or the data differ.
+    """Return one table per reduced sensor in the form of the paper, if the data are the paper's.
 
     A sensor is reduced if it learns from a fraction of the batches, as in the paper, or if its split has fewer slides
     than the other's. If both were run, the paper's method is used.
@@ -252,7 +252,9 @@ def reduction_tables(methods: Sequence[Method]) -> list[Table]:
     if not all(method.published for method in candidates):
         return []
     joint_methods = [method for method in candidates if method.family == JOINT]
-    reduced_sensors = {str(m.settings[name]) for m in joint_methods for name in ("subsample_sensor", "few_of")}
+    reduced_sensors = {
+        str(method.settings[name]) for method in joint_methods for name in ("subsample_sensor", "few_of")
+    }
     return [_reduction_table(candidates, sensor) for sensor in TABLE_NUMBERS if sensor in reduced_sensors]
 
 
@@ -419,7 +421,7 @@ def _count_held_out(sets: Collection[str], sensor: str) -> int:
 
 
 def _zero_shot_cells(results: Sequence[HeldOutAccuracy], sensor: str, materials: int) -> list[str | Cell]:
-    """Return the cells for the held-out materials of one sensor."""
+    """Return the cells for the held-out materials of one sensor: its accuracy, chance, and the number of runs."""
     correct, evaluated, low, high = _zero_shot_counts(results, sensor, materials)
     if not evaluated:
         return [NONE, NONE, str(len(results))]

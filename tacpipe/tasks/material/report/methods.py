@@ -78,17 +78,17 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
 
     @property
     def learned(self) -> Mapping[str, int]:
-        """Number of training slides by sensor; readouts may also learn from validation slides."""
-        params = self.params
+        """Number of slides that the model learns from, by sensor. Readouts may also learn from validation slides."""
+        params, counts = self.params, dict(self.trained)
         is_readout = kind_of(self.architecture).IS_READOUT
         if is_readout and params.get("use_validation") and params.get("labels") != "permuted":
-            watched = self.config["counts"].get("val", {})
-            return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
-        batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
-        return {
-            sensor: slides_kept(count, batch, percent) if sensor == params.get("subsample_sensor") else count
-            for sensor, count in self.trained.items()
-        }
+            validation_counts = self.config["counts"].get("val", {})
+            return {sensor: count + validation_counts.get(sensor, 0) for sensor, count in counts.items()}
+        reduced_sensor = params.get("subsample_sensor")
+        if reduced_sensor in counts:
+            batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
+            counts[reduced_sensor] = slides_kept(counts[reduced_sensor], batch, percent)
+        return counts
 
     @property
     def architecture(self) -> str:
