@@ -30,7 +30,7 @@ class Params:
     """Uncertainty of a model."""
 
     quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50
-    # quantiles: true widens bands to cover their level within a new recording, false on average over recordings
+    # quantiles: if true, bands cover their level within each new recording; if false, on average over recordings
     promise: bool = False
     # classifiers: fraction of recordings of known classes that may be classified as unknown
     false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05

@@ -53,7 +53,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     else:
         with model_files.validated("the model"):
             result = task.evaluate(model, recordings)
-    if headline.FILE not in result.files:  # a task from another package may have none
+    if headline.FILE not in result.files:  # results of tasks from other packages may have no headline
         return result
     summarized = headline.write_summary(headline.read(result.files[headline.FILE]), task.short_names)
     return dataclasses.replace(result, files={**result.files, headline.SUMMARY: summarized})

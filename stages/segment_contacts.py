@@ -44,14 +44,14 @@ class Params(StreamSelection):
 
     # free: the recording starts without contact; grasped: all of the recording is one contact
     begins: Literal["free", "grasped"] = "free"
-    # time at the start whose median is each channel's level without load
+    # duration at the start whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.2
     # mean change of a finger's taxels from rest at which contact starts
     on_count: Annotated[PositiveFloat, Unit("count")] = 120.0
     off_count: Annotated[NonNegativeFloat, Unit("count")] = 80.0  # mean change below which contact ends
     merge_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # maximum gap between two contacts that are merged
     min_s: Annotated[NonNegativeFloat, Unit("s")] = 0.3  # minimum duration of a contact
-    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # time before and after each contact that is included in it
+    pad_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5  # duration before and after a contact that is added to it
     # level at which contact starts, for streams in other units; by default from the noise at rest
     on_level: PositiveFloat | None = added(None)
     # level below which contact ends, for streams in other units; by default two thirds of on_level

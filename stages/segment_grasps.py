@@ -38,11 +38,11 @@ class Params(StreamSelection):
     plane_mm: Annotated[PositiveFloat, Unit("mm")] = 6.0
     # fraction of the scene's points that the table must contain
     plane_fraction: Annotated[Fraction, StoredAs("plane_share")] = 0.2
-    plane_trials: PositiveInt = 1000  # random samples to find a plane
-    seed: Seed = 0  # random seed of these samples
+    plane_trials: PositiveInt = 1000  # number of random samples for finding a plane
+    seed: Seed = 0  # random seed of the samples for planes
     # maximum distance between neighbouring points of one object
     cluster_mm: Annotated[PositiveFloat, Unit("mm")] = 12.0
-    cluster_points: PositiveInt = 6  # minimum number of neighbours within that distance; points with fewer are stray
+    cluster_points: PositiveInt = 6  # minimum number of neighbours within cluster_mm; points with fewer are stray
     object_points: PositiveInt = 50  # minimum number of points of an object; fewer are noise of the table
     # maximum distance of the object from the line between the fingers, or from its sight line
     near_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0
@@ -50,13 +50,13 @@ class Params(StreamSelection):
     outlier_neighbours: PositiveInt = 20
     # standard deviations of that distance above its mean beyond which a point is stray
     outlier_deviations: PositiveFloat = 5.0
-    # time at the start whose median is each finger's pressure without load
+    # duration at the start whose median is each finger's pressure without load
     rest_s: Annotated[PositiveFloat, Unit("s")] = 0.5
     # pressure above rest at which a finger is in contact; noise is 0.25
     on_count: Annotated[PositiveFloat, Unit("count")] = 20.0
     # time for which both fingers must press, and over which the reading is the median
     settle_s: Annotated[PositiveFloat, Unit("s")] = 0.2
-    settled_count: Annotated[NonNegativeFloat, Unit("count")] = 3.0  # maximum variation of the pressure in that time
+    settled_count: Annotated[NonNegativeFloat, Unit("count")] = 3.0  # maximum variation of the pressure in settle_s
 
 
 @stage(version=2)

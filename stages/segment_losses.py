@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 class Params(StreamSelection):
     """Criteria for contact and motion, in the unit of the tactile channels."""
 
-    end_rows: PositiveInt = 8  # last rows of a recording whose median shows the untouched sensor
+    end_rows: PositiveInt = 8  # number of last rows whose median shows the untouched sensor
     # root mean square difference from the end, over the channels of a stream, above which an object is touched
     contact_level: PositiveFloat = 1.0
     # the same as a fraction of the 90th percentile of the recording
     contact_fraction: Fraction = 0.15
-    # shortest contact before a loss
+    # minimum duration of the contact before a loss
     contact_s: Annotated[NonNegativeFloat, Unit("s")] = 0.5
     # root mean square change between two rows above which the object moves
     motion_level: PositiveFloat = 0.6
-    # time without motion that separates the loss from earlier motion
+    # duration without motion that separates the loss from earlier motion
     quiet_s: Annotated[PositiveFloat, Unit("s")] = 0.2
 
 

@@ -61,7 +61,8 @@ class Params(StreamSelection):
     pressure_trigger: Annotated[NonNegativeFloat, Unit("count")] = 40.0
     # fraction of speed_m_s above which the arm slides; only if the arm was recorded
     moving_fraction: Annotated[Fraction, StoredAs("moving_share")] = 0.5
-    steady_frames: PositiveInt = 5  # number of rows for which the arm must move so fast, to ignore isolated outliers
+    # number of successive rows in which the arm must be that fast, so that isolated outliers are ignored
+    steady_frames: PositiveInt = 5
     # frames to keep: middle ones; offset: those from offset_frames after the trigger; none: all
     crop: Literal["middle", "offset", "none"] = "middle"
     frames: PositiveInt = 400  # number of rows to keep; recordings without static pressure are kept whole
@@ -85,7 +86,7 @@ class Params(StreamSelection):
     trigger: Literal["pressure", "load"] = added("pressure")
     # load at which the slide starts, in the unit of the taxels; by default from their noise at rest
     load_trigger: PositiveFloat | None = added(None)
-    # time whose median is each channel's level without load
+    # duration whose median is each channel's level without load
     rest_s: Annotated[NonNegativeFloat, Unit("s")] = added(0.2)
     # position of rest_s: start of the recording; lowest: where the channels together are lowest
     rest: Literal["start", "lowest"] = added("start")
@@ -172,7 +173,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
 
     stream = finger_stream(name, streams)
     t_ns, names = stream.column("t_ns").to_numpy(), columns_with_quantity(stream, "tactile")
-    measured = np.ones(len(names), bool)  # (channel,), whether it has a value in each row
+    measured = np.ones(len(names), bool)  # (channel,), whether a channel has a value in each row
 
     def blocks() -> Iterator[AnyArray]:
         nonlocal measured
@@ -205,7 +206,8 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
         raise TacpipeError(f"Recording {name}: {error}") from error
     kept_rows = slice(first, stop)
     height = params.spike_count if unit == COUNT else limits.on
-    begin, end = max(0, first - params.spike_frames), stop + params.spike_frames  # rows that the medians read
+    # range of rows over which the medians are computed
+    begin, end = max(0, first - params.spike_frames), stop + params.spike_frames
     pieces, count = [], 0
     for some in _batches(stream, stream.schema.names):
         pieces.append(some.slice(max(0, begin - count), max(0, end - max(begin, count))))

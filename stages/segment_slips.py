@@ -45,7 +45,7 @@ class Params(StreamSelection):
     channel: str = ""  # column with the readings; empty: the only one whose quantity is proximity
     # cut-off of the low-pass filter applied before the rate is computed
     cutoff_hz: Annotated[PositiveFloat, Unit("Hz")] = 5.0
-    # time after the grasp without slip, from which noise and level are estimated
+    # duration without slip after the grasp, from which noise and level are estimated
     still_s: Annotated[PositiveFloat, Unit("s")] = 0.5
     on_sigma: PositiveFloat = 5.0  # rate above which a slip starts, in multiples of its noise
     off_sigma: PositiveFloat = 2.0  # rate below which a slip ends, in multiples of its noise

@@ -40,7 +40,7 @@ class Params:
     effort: NonNegativeFloat = 0.0
     friction_scale: PositiveFloat = 1.0  # factor of the drawn friction; with 4 nothing slips
     grip_loss_probability: Fraction = 0.0  # fraction of trials in which the grip weakens without warning
-    grip_loss: Fraction = 0.2  # fraction of the grip force that is then lost
+    grip_loss: Fraction = 0.2  # fraction of the grip force that is lost when the grip weakens
     # sideways distance from the grasp to the centre of mass; it twists the object
     lever_m: Annotated[NonNegativeFloat, Unit("m")] = 0.0
     still: bool = False  # hold the lifted object still from first to last row, without drift and creep
@@ -155,7 +155,7 @@ class TouchParams:
     # multiple of the noise of a real camera (1.5 mm at 1 m) and real sensors (3.5 to 6.4 counts)
     noise_scale: NonNegativeFloat = 1.0
     drift_count_day: Annotated[NonNegativeFloat, Unit("count/day")] = 30.0  # root mean square drift of the sensors
-    raw: bool = False  # the camera's whole view and the sensors over time, for `segment grasps`
+    raw: bool = False  # record the camera's whole view and the sensors over time, for `segment grasps`
 
     def check(self) -> None:
         """Raise an error for whole views of spheres of different sizes, which have no table."""

@@ -36,7 +36,7 @@ Timeline = Literal["uniform", "logged", "fresh"]
 class Params(StreamSelection):
     """The rows, the clock of samples, and the definition of a gap."""
 
-    rate_hz: Rate | None = None  # rate of the rows; without it they are at the stamps of the master
+    rate_hz: Rate | None = None  # rate of the rows; without it, rows are at the timestamps of the master
     # hold: newest sample that had arrived; interpolate: between samples, which looks ahead, for offline analysis
     values: Literal["hold", "interpolate"] = "hold"
     # rows without rate_hz: logged: every sample of the master; fresh: samples that are not repeated

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
+WALL_CLOCK_NS = 10**18  # timestamps above this (2001) are Unix time
 _WIDE = ("W", "F")  # widths of East Asian letters that occupy two cells
-_SHORT = reprlib.Repr()  # looks no deeper and no further than it prints, so that aliases of aliases cost nothing
+_SHORT = reprlib.Repr()  # visits only what it prints, so that aliases of aliases cost no time
 _SHORT.maxlevel = 2
 _SHORT.maxstring = _SHORT.maxother = 60
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxset = 4
@@ -25,7 +25,7 @@ def excerpt(value: Any) -> str:
     """
     try:
         return _SHORT.repr(value)
-    except ValueError:  # Python prints no number of more than 4300 digits
+    except ValueError:  # Python refuses to print integers of more than 4300 digits
         return "a number of thousands of digits"
 
 

@@ -72,7 +72,7 @@ class LslDescription:
     name: str
     kind: str  # type, such as "EEG" or "Markers"
     format: str  # key of `FORMATS`
-    rate_hz: float  # 0: irregular
+    rate_hz: float  # samples per second; 0: irregular
     channels: tuple[LslChannel, ...]
     source_id: str = ""
     uid: str = ""

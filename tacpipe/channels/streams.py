@@ -19,8 +19,8 @@ Table = TypeVar("Table", "pa.Table", "pa.Table | Columns")
 COUNT = "count"  # unit of raw readings
 EVENTS = "events"  # stream of problems during recording; not a signal
 TRUTH = "gt_"  # prefix of ground-truth columns
-_GAP_FACTOR = 3.0  # smallest gap as a multiple of the median step
-_PIECE_ROWS = 1 << 20  # rows in memory
+_GAP_FACTOR = 3.0  # minimum gap as a multiple of the median step
+_PIECE_ROWS = 1 << 20  # number of rows in memory at once
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Clocks:
 
     start_ns: int
     stop_ns: int
-    rate_hz: float | None  # from the function `rate_hz`
+    rate_hz: float | None  # samples per second, as the function `rate_hz` returns it
     gap_starts_ns: Times  # (gap,)
     gap_stops_ns: Times  # (gap,)
 
@@ -81,7 +81,8 @@ def rate_hz(table: pa.Table | Columns) -> float | None:
     if "t_ns" not in table.column_names or table.num_rows < 2:
         return None
     step_ns = np.diff(table.column("t_ns").to_numpy())  # (time - 1,)
-    if "seq" in table.column_names and step_ns.sum() > 0:  # with a sample counter, late arrivals are not gaps
+    # late arrivals are not gaps if a sample counter shows that no sample is missing
+    if "seq" in table.column_names and step_ns.sum() > 0:
         return round(float(np.diff(table.column("seq").to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
     median_step_ns = float(np.median(step_ns))
     return round(1e9 / median_step_ns, 3) if median_step_ns else None
@@ -96,7 +97,8 @@ def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
     import numpy as np
 
     step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
-    if "seq" in table.column_names and step_ns.sum() > 0:  # with a sample counter, late arrivals are not gaps
+    # late arrivals are not gaps if a sample counter shows that no sample is missing
+    if "seq" in table.column_names and step_ns.sum() > 0:
         return np.flatnonzero(np.diff(table["seq"].to_numpy()) > 1) + 1
     typical_ns = float(np.median(step_ns)) if median_ns is None else median_ns
     return np.flatnonzero(step_ns > _GAP_FACTOR * typical_ns) + 1

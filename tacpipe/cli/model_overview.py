@@ -53,7 +53,7 @@ class TrainingCounts(TypedDict):
     """Numbers of recordings that a model was trained on."""
 
     recordings: int | None  # number of recordings for training and validation
-    roles: Figures  # number by role, or by role and sensor
+    roles: Figures  # number of recordings by role, or by role and sensor
 
 
 class ModelDescription(ModelOrigin):

@@ -257,7 +257,8 @@ def _run_process(command: str | list[str]) -> int:
             code = process.wait()
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                process.send_signal(signal.SIGINT)  # A terminal also signals the command, a scheduler does not.
+                # A terminal sends the signal also to the command, but a scheduler does not.
+                process.send_signal(signal.SIGINT)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(termination.GRACE_S)
             raise

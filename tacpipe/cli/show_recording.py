@@ -50,7 +50,7 @@ class StreamFigures(TypedDict, total=False):
     gap_shares: dict[str, float]
     held_share: float
     saturated: int
-    codec: str  # this and the next five: only for streams of frames
+    codec: str  # this field and the next five exist only for streams of frames
     width_px: int
     height_px: int
     pixel_format: str

@@ -35,7 +35,8 @@ OWN = (
     "tacpipe.engine.pipeline",
     "tacpipe.io.parquet",
 )
-OTHERS = ("yaml", "pydantic.type_adapter", "pandas")  # imported by params, typer and pyarrow's conversion of columns
+# libraries that are imported by params, typer and pyarrow's conversion of columns
+OTHERS = ("yaml", "pydantic.type_adapter", "pandas")
 MODULES = OWN + OTHERS
 LEARNING = ("torch", "tacpipe.training.loop")
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 COUNT = 10
 SHIFT = 0.4  # fraction of the object's length; 90 % of the published grasps are within 0.33 of its middle
 OPENING_M = (0.020, 0.130)  # minimum and maximum opening; the published grasps have 0.026 to 0.121
-MIN_POINTS = 50  # minimum for estimating a shape; published clouds have 814 or more
+MIN_POINTS = 50  # minimum number of points for estimating a shape; published clouds have 814 or more
 MAX_POINTS = 20_000  # larger clouds are subsampled: more points cost time and do not change the shape
 MIN_CUT_POINTS = 6  # minimum number of points in a cut
 FLAT_M = 0.003  # thickness below which a cloud is a plane with noise; the thinnest published cloud has 0.026
@@ -54,7 +54,7 @@ class Candidate:
     grasp: Grasp
     score: float  # at most 1; each deviation from the ideal lowers it
     off_deg: float  # angle between the closing axis and the surface normal, at the finger where it is larger
-    shift_m: float  # along the first axis from the centroid to the cut
+    shift_m: float  # distance from the centroid to the cut along the first axis
 
 
 @dataclass(frozen=True)
@@ -279,7 +279,7 @@ def _draw_panel(
 ) -> None:
     """Draw a cloud and its grasps on two of the axes x, y, z, in millimetres; the second axis points down as in an image."""
     right, down = plotted_axes
-    depth_axis = 3 - right - down  # the viewing axis
+    depth_axis = 3 - right - down  # the axis along which the picture is seen
     order = np.argsort(-cloud.points_m[:, depth_axis], kind="stable")  # near points are drawn last
     axes.set_facecolor(BACKGROUND)
     points_mm = cloud.points_m[order] * 1e3

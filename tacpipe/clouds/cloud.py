@@ -82,7 +82,7 @@ class Cloud:
 
 def require_columns(table: pa.Table, names: Sequence[str]) -> None:
     """Raise `TacpipeError` with the first of ``names`` that is not a column of the table."""
-    columns = set(table.column_names)  # the table builds this list at each access
+    columns = set(table.column_names)  # a set, because the table creates the list of names at each access
     missing = [name for name in names if name not in columns]
     if missing:
         raise TacpipeError(f"The column {missing[0]} is missing. Ingest or segment the recording again.")
@@ -148,7 +148,7 @@ def open3d() -> Iterator[Any]:
         yield module
 
 
-RADIUS_M = 0.015  # of 10 to 30 mm, the radius at which the published grasps are closest to the surface normals
+RADIUS_M = 0.015  # of radii from 10 to 30 mm, that at which the published grasps are closest to the surface normals
 CAMERA_M = (0.0, 0.0, 0.0)  # the camera is at the origin of its own frame
 
 

@@ -32,7 +32,7 @@ POSITION = ("x", "y", "z")
 COLOURS = ("rgb", "rgba")  # either name is valid; the alpha of rgba is ignored
 MAX_HEADER_BYTES = 65_536  # a file without a DATA line in these is not PCD
 DIGITS = 18  # maximum number of digits of a number in a header
-MAX_POINT_BYTES = 65_536  # including skipped fields
+MAX_POINT_BYTES = 65_536  # maximum size of a point, including skipped fields
 LZF_MAX_RATIO = 88  # maximum compression ratio: three bytes unpack to 264
 
 
@@ -43,7 +43,7 @@ class Header:
     point: np.dtype[np.void]  # the fields of a point, packed
     points: int
     data: str  # ascii, binary or binary_compressed
-    length: int  # bytes of the header, including its last line end
+    length: int  # size of the header in bytes, including its last line end
 
     @property
     def colour(self) -> str | None:
@@ -283,8 +283,8 @@ class _Header:
     form: str
     vertex: np.dtype[np.void]
     points: int
-    length: int  # bytes, including the line end after end_header
-    only_vertices: bool  # no other element follows
+    length: int  # size of the header in bytes, including the line end after end_header
+    only_vertices: bool  # whether the vertices are the last element
     skipped: int  # size of other elements before the vertices: bytes, or lines of a text file
 
 

@@ -30,7 +30,7 @@ class SegmentationLimits:
 
     plane_m: float  # maximum distance of a point from its plane; raised for noisier points
     plane_fraction: float  # minimum fraction of all points on the table
-    plane_trials: int  # random samples per plane
+    plane_trials: int  # number of random samples per plane
     cluster_m: float  # maximum distance between neighbours in an object
     cluster_points: int  # minimum number of points within that distance, itself included, for a core point
     object_points: int  # minimum number of points of an object
@@ -46,7 +46,8 @@ def object_rows(scene: Cloud, grasp: Grasp, limits: SegmentationLimits, seed: in
     """
     points_m = scene.points_m.astype(np.float64)
     height_m = heights_m(points_m, table_plane(points_m, grasp, limits, seed))  # (point,)
-    noise_m = 1.4826 * float(np.median(np.abs(height_m[np.abs(height_m) <= 3 * limits.plane_m])))  # standard deviation
+    # standard deviation of the height
+    noise_m = 1.4826 * float(np.median(np.abs(height_m[np.abs(height_m) <= 3 * limits.plane_m])))
     front_rows = np.flatnonzero(height_m > max(limits.plane_m, NOISE_DEVIATIONS * noise_m))
     labels = _clusters(points_m[front_rows], limits)
     if not (labels >= 0).any():

@@ -20,7 +20,7 @@ from tacpipe.codecs import codec, measures
 from tacpipe.datasets import model_files
 
 if TYPE_CHECKING:
-    Layers = tuple[tuple[AnyFloats, AnyFloats], ...]  # weight (out, in) and bias (out,) of each
+    Layers = tuple[tuple[AnyFloats, AnyFloats], ...]  # weight (out, in) and bias (out,) of each layer
 
 CHUNK = 16384  # rows per chunk, which bounds the memory of hidden layers
 
@@ -35,7 +35,7 @@ class Autoencoder:
     scale_count: AnyFloats  # (channel,)
     encoder: Layers
     decoder: Layers
-    frames: int = 1  # number of successive rows that it reads
+    frames: int = 1  # number of successive rows that the encoder reads
     representation: str = codec.LEVELS
     measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "autoencoder"

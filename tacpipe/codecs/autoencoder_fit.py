@@ -31,7 +31,7 @@ from tacpipe.training import devices, loop
 FRAMES = (1, 2, 3)  # frames of the classes C1, C2 and C3
 HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # frames -> hidden layers between input and latents
 SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # hidden layers that a search tries, to be multiplied by the frames
-STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # factors of learning rate and weight decay that a search tries
+STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # factors of learning rate and weight decay that a search tries, as pairs
 MAX_SEARCH = len(SHAPES) * len(STEPS)
 GRADIENT_CLIP = 1.0  # maximum norm of the gradient, as for the forecasters
 
@@ -42,7 +42,7 @@ class NetworkShape:
 
     hidden: tuple[int, ...]
     learning_rate: float
-    weight_decay: float  # of Adam: this fraction of a weight is added to its gradient
+    weight_decay: float  # weight decay of Adam: fraction of a weight that is added to its gradient
 
 
 def candidate_networks(

@@ -57,7 +57,7 @@ class Stacking:
     def __init__(self, representation: str, frames: int = 1) -> None:
         check_representation(representation)
         self._representation, self._frames = representation, frames
-        self._values: AnyFloats | None = None  # the last rows
+        self._values: AnyFloats | None = None  # rows of the previous call that the next latents depend on
         self._begins = np.zeros(0, dtype=bool)
 
     def next(self, values: AnyFloats, begins: Bools) -> AnyFloats:

@@ -28,7 +28,7 @@ CHANNELS = (3, 16, 32, 32)  # colours, and channels after each convolution
 INNER = (CHANNELS[-1], ROWS // 8, COLUMNS // 8)  # shape after the convolutions
 GRADIENT_CLIP = 1.0  # maximum norm of the gradient
 WEIGHTS = "encoder.safetensors"
-Encode = Callable[[Bytes], Float32s]  # images, uint8 (frame, height, width, rgb), to features (frame, feature)
+Encode = Callable[[Bytes], Float32s]  # maps images, uint8 (frame, height, width, rgb), to features (frame, feature)
 
 
 class _Network(nn.Module):

@@ -41,7 +41,7 @@ class PCA:
     mean_count: AnyFloats  # (channel,)
     scale_count: AnyFloats  # (channel,)
     components: AnyFloats  # (latent, channel)
-    explained_ratio: AnyFloats  # (component,), of all components, including those that are dropped
+    explained_ratio: AnyFloats  # (component,), for all components, including dropped ones
     representation: str = codecs.LEVELS
     measured: measures.CodecMeasures = field(default_factory=measures.CodecMeasures)
     kind: str = "pca"

@@ -50,7 +50,7 @@ class ComparisonRow:
     spread: float  # standard deviation of the score over runs; NaN for a single run
     baseline: str  # best baseline on the same recordings; empty for baselines, and if none was evaluated
     gain: Gain  # gain over the baseline
-    p: float  # p value of the hypothesis that both are equal (`pairing.swap_test`), not corrected for the number of methods
+    p: float  # p value for equality with the baseline (`pairing.swap_test`), not corrected for the number of methods
     n: int  # number of clusters
     recordings: int
     runs: int

@@ -131,14 +131,14 @@ class ComparedRun(Generic[Details]):
     dataset: Dataset
     task: str
     method: str  # name of all runs that differ only in settings
-    settings: Settings  # settings that define its method; neither seed nor fold
+    settings: Settings  # settings that define the method; neither seed nor fold
     questions: Mapping[Question, PredictorErrors]
     family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None
-    # whether it was trained to show the size of an effect, for example with a wrong plan or fewer data
+    # whether the run is a control that shows the size of an effect, such as a wrong plan or fewer data
     control: bool = False
-    published: bool = False  # whether it was evaluated only on the recordings of the task's paper
+    published: bool = False  # whether the run was evaluated only on recordings of the task's paper
     details: Details = None  # type: ignore[assignment]  # data for the task's own sections, if it has any
 
     @property

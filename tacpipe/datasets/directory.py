@@ -120,12 +120,12 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     elif not current:  # existing files are not written again, so the cost depends only on new recordings
         before = _current_manifest(directory)
         unlike, removed = _compare_files(before, manifest, directory, is_complete=planned.is_complete)
-        if before is None:  # its pages have other names than those of the previous manifest
+        if before is None:  # the names of its pages differ from those of the previous manifest
             removed |= _compare_pages(replacing.former(store, directory), manifest, directory)[1]
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *removed})
     edited = []
-    if manifest.exported or planned.replace:  # nothing else replaces an export
+    if manifest.exported or planned.replace:  # only these two replace an export
         edited = _edited_files(store, manifest, directory, {*stale, *removed})
     if edited and not planned.replace:
         raise replacing.edited_files_error(directory, edited)
@@ -314,7 +314,7 @@ def _remove(directory: Path, paths: set[str]) -> None:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
     folders = {directory / folder for path in paths for folder in list(Path(path).parents)[:-1]}
-    for folder in sorted(folders, key=lambda path_: len(path_.parts), reverse=True):  # the deepest first
+    for folder in sorted(folders, key=lambda path_: len(path_.parts), reverse=True):  # deepest folders first
         with contextlib.suppress(OSError):  # not empty, or already removed
             folder.rmdir()
 
@@ -356,7 +356,7 @@ def place(store: Store, name: str, path: Path, *, copy: bool) -> None:
     source = store.object_path(name)
     try:
         if copy or not _link(source, draft):
-            write_whole(str(path), store.blocks(name), str(draft))  # verified before it gets its name
+            write_whole(str(path), store.blocks(name), str(draft))  # the content is verified before the file is renamed
         else:
             draft.replace(path)
     except FileNotFoundError:
@@ -385,7 +385,7 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
     try:
         status = os.lstat(path)
         symbolic = stat.S_ISLNK(status.st_mode)
-        if symbolic:  # its target may change without a change of the directory
+        if symbolic:  # the target of a link may change without a change of the directory
             status = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
     except (FileNotFoundError, NotADirectoryError):

@@ -33,7 +33,7 @@ class LostNode(TypedDict):
 
     manifest: str  # digest
     digest: str
-    lost: str  # reason why it cannot be read
+    lost: str  # reason why the manifest cannot be read
 
 
 @final

@@ -53,7 +53,7 @@ class ManifestJson(TypedDict):
     inputs: dict[str, list[InputDataset]]
     chain: list[Step]
     recordings: NotRequired[dict[str, RecordingEntry]]
-    pages: NotRequired[list[PageJson]]  # instead of recordings, labels and sources
+    pages: NotRequired[list[PageJson]]  # pages that replace recordings, labels and sources
     files: dict[str, Content]
     skipped: dict[str, str]
     sources: NotRequired[dict[str, Mapping[str, str]]]
@@ -321,7 +321,7 @@ def parse(content: bytes, source: str, read: PageReader | None = None, *, verifi
             f"{excerpt(declared)[1:13]}. Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     manifest.__dict__.update(content=content, content_digest=name, digest=declared)  # fills cached properties
-    if not verified:  # checks all of its content
+    if not verified:  # this access checks all of the content
         _parsed[place] = manifest
         for oldest in list(_parsed)[:-_REMEMBERED]:
             del _parsed[oldest]
@@ -343,7 +343,7 @@ def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[
         )
     if format_version == FORMAT:
         manifest = Manifest(**value)
-        manifest.__dict__["pages"] = None  # regardless of the number of recordings
+        manifest.__dict__["pages"] = None  # the manifest contains its recordings, regardless of their number
         return manifest, declared
     pages = Pages([Page.from_json(page) for page in value.pop("pages")], read, {})
     if pages.total("recordings") <= pages_of.INLINE:

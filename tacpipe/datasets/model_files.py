@@ -132,7 +132,7 @@ def build_with_weights(build: Callable[[], torch.nn.Module], weights: Mapping[st
     import torch
 
     with validated("the model"), torch.device("meta"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # layers without width, which are rejected below
+        warnings.simplefilter("ignore")  # torch warns of layers without width, which are rejected below
         network = build()
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     shapes = {name: tuple(value.shape) for name, value in weights.items()}

@@ -146,7 +146,7 @@ class PageContent:
             len(stored),
             digest(described(self.recordings)),
             len(self.recordings),
-            sum(shard.get("rows", 0) for shard in shards),  # entries in the input of a key have neither
+            sum(shard.get("rows", 0) for shard in shards),  # entries in the input of a key have neither rows nor bytes
             sum(shard.get("bytes", 0) for shard in shards),
             len(self.labels),
             len(self.sources),
@@ -173,7 +173,7 @@ class PageContent:
 class PageReader(Protocol):
     """Reads the objects of pages."""
 
-    place: str  # location of the objects, for messages
+    place: str  # location of the objects, used in messages
 
     def __call__(self, page: Page) -> bytes:
         """Return the verified bytes of a page's object. Raises `MissingPageError`."""

@@ -20,7 +20,8 @@ from tacpipe.printable import plain
 
 MANIFEST = "manifest.json"
 NAME_BYTES = 200  # maximum length of a path component; file systems allow 255, and drafts append to it
-_PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # or a file of Zarr
+# or the name of a metadata file of Zarr
+_PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
 _SHARED = f"two of its shards and files share a path, or one is called {MANIFEST}"
@@ -67,7 +68,7 @@ def refuse_shared_paths(paths: Sequence[str]) -> None:
         raise ValueError(_SHARED)
 
 
-MAX_NAME_BYTES = NAME_BYTES - len(".parquet")  # bytes of UTF-8
+MAX_NAME_BYTES = NAME_BYTES - len(".parquet")  # maximum length in bytes of UTF-8
 _MARK = 8  # hex digits of the digest at the end of a truncated name
 _ASCII = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._-")
 

@@ -142,7 +142,8 @@ def losses(before: Manifest, after: Manifest) -> Losses:
     """Return the irreplaceable content of ``before`` that ``after`` lacks."""
     if not lasting(before):
         return Losses()
-    lost: dict[bool, list[str]] = {True: [], False: []}  # names by whether the recording is lost, or only labels
+    # names of lost recordings (True), and of recordings that lost only labels (False)
+    lost: dict[bool, list[str]] = {True: [], False: []}
     for name in pages.differing(before.recordings, after.recordings)[0]:
         if irreplaceable(before) and _is_gone(name, before, after):
             lost[True].append(name)

@@ -42,7 +42,7 @@ class Scheme:
     apart: str = ""  # kfold: attribute whose values are divided among the folds, each unknown in one; empty for none
     repeats: int = 1  # random: number of folds, each drawn independently
     reverse: bool = False  # blocked: test the first recordings and train on the last
-    few: int = 0  # number of training recordings, the others are unused; 0 for all
+    few: int = 0  # number of training recordings; others are unused; 0 for all
     few_by: str = ""  # attribute with ``few`` training recordings per value; empty for ``few`` in total
     # attribute=value of the recordings that ``few`` applies to, such as sensor=roboskin; empty for all
     few_of: str = ""

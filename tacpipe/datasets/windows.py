@@ -62,7 +62,7 @@ class _Selection(NamedTuple):
 class _RecordingRows(NamedTuple):
     """The rows of one recording."""
 
-    values: torch.Tensor  # (time, channel), relative to rest if that is subtracted, not scaled
+    values: torch.Tensor  # (time, channel), not scaled; relative to rest if the rest level is subtracted
     t_ns: torch.Tensor  # (time,)
     starts: Int64s  # (window,), first row of each window
 
@@ -108,7 +108,9 @@ class Windows(torch.utils.data.Dataset[Window]):
 
         Raises `UsageError` for invalid options.
         """
-        window_starts(np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride)  # rejects lengths below 1
+        window_starts(
+            np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride
+        )  # raises an error for lengths below 1
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
         if columns is not None and not (inputs is None and targets is None):
@@ -215,7 +217,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             np.add.at(inside, rows.starts, 1)
             np.add.at(inside, rows.starts + self.context + self.horizon, -1)
             values = rows.values.numpy()[np.cumsum(inside)[:-1] > 0].astype(np.float64)
-            if len(values):  # means and squares of two parts add up to those of the whole
+            if len(values):  # means and squares of two parts can be added
                 difference = values.mean(axis=0) - mean
                 total = count + len(values)
                 squares += ((values - values.mean(axis=0)) ** 2).sum(axis=0) + difference**2 * count * len(

@@ -244,7 +244,7 @@ class ByRecording:
                 self.outcome.reused += not result.is_new
                 self.outcome.add_record(name, result.recording, result.record)
                 made_by = result.record["provenance"]
-                computed[result.recording] = {  # only the necessary fields, because there may be a million
+                computed[result.recording] = {  # only the necessary fields, because there may be a million recordings
                     "result": result.record["result"],
                     "provenance": {
                         "notes": made_by.get("notes", []),
@@ -262,7 +262,8 @@ class ByRecording:
 
         ``bad`` contains the failures by recording.
         """
-        source = f"{self.request.source}/"  # The location of files is not part of a manifest
+        # paths are relative, because the location of files is not part of a manifest
+        source = f"{self.request.source}/"
         self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
         other_errors = sorted({(-failure.exit_code, failure.error) for failure in bad.values() if not failure.at_fault})
         if other_errors and all(

@@ -116,7 +116,7 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-PARAMS = "params.yaml"  # its values can be used in every text
+PARAMS = "params.yaml"  # params file whose values can be used in every text of a chain
 _OUTPUTS = ("outs", "metrics", "plots")
 _SHOWN = 8  # number of stage names listed in an error
 
@@ -227,7 +227,8 @@ def _check(content: Json, schema: Json, place: str) -> None:
     for key, value in content.items():
         if key not in schema:
             raise UsageError(f"{place}: there is no key {excerpt(key)}; there are {listed(schema, len(schema))}.")
-        if not _fits(value, schema[key]) and not (key == "do" and isinstance(value, Mapping)):  # keys are checked below
+        # the keys of a mapping are checked below
+        if not _fits(value, schema[key]) and not (key == "do" and isinstance(value, Mapping)):
             expected = _EXPECTED.get(key, "a text")
             raise UsageError(f"{place}: its {key} is {excerpt(value)}; it must be {expected}.")
 

@@ -127,7 +127,7 @@ def estimate_duration(requests: Sequence[Request], jobs: int) -> DurationEstimat
         try:
             missing = [request for request in requests if _is_missing(request)]
             each_s = _measure_duration(missing[0]) if missing else None
-        except TacpipeError:  # the grid reports it
+        except TacpipeError:  # the grid reports the error
             return None
     if each_s is None:
         return None
@@ -162,7 +162,7 @@ def _measure_duration(request: Request) -> float | None:
             pipeline.run(replace(request, executor="local", track=()))
     except _TimedError:
         return stopwatch.all_s
-    return None  # already stored, and no network was trained
+    return None  # the model is already stored, so no network was trained
 
 
 class _TimedError(Exception):
@@ -173,9 +173,10 @@ class _Stopwatch:
     """Times batches of the first network and then ends its training."""
 
     def __init__(self, network: TrainedNetwork) -> None:
-        self.all_s = 0.0  # reading, and all epochs of the other networks
+        self.all_s = 0.0  # time for reading, and for all epochs of the other networks
         self._started_s = self._begun_s = time.monotonic()
-        self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
+        # time, and completed fraction of the epoch, after the first batch
+        self._first: tuple[float, float] | None = None
         self._network, self._done = network, 0
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:

@@ -43,7 +43,8 @@ class Outcome:
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    recordings_by_note: dict[str, list[str]] = field(default_factory=dict)  # recordings by the stage's note about them
+    # names of recordings by the stage's note about them
+    recordings_by_note: dict[str, list[str]] = field(default_factory=dict)
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # number of results by stage and digest of its code
     # number of results by plug-in package and digest of its code
     packages: dict[str, dict[str, int]] = field(default_factory=dict)

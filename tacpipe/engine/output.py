@@ -100,7 +100,7 @@ def settle(store: Store, request: Request, plan: replacing.ResultPlan, work: Com
         try:
             result = work.result(rerun=request.rerun, previous=previous)
             return target.published(work, result, previous)
-        except MissingError:  # linking found a damaged object: recompute all that are damaged
+        except MissingError:  # linking detected a damaged object: recompute all damaged objects
             if result is not None:
                 _quarantine_damaged(store, result)
             return target.published(work, work.result(rerun=False))

@@ -78,7 +78,8 @@ def existing_outcome(request: Request) -> Outcome | None:
     Raises the errors that `run` would raise before that. Computes and changes nothing.
     """
     started = time.perf_counter()
-    if request.check or request.compare or request.rerun or request.track:  # these always compute or report something
+    # these options always compute or report something
+    if request.check or request.compare or request.rerun or request.track:
         return None
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
@@ -174,7 +175,7 @@ class _RequestRun:
                 page.digest for page in (stored_manifest.pages.pages if stored_manifest.pages is not None else ())
             )
             sizes = list(stored_manifest.sizes())
-        except MissingError:  # of the manifest or one of its pages
+        except MissingError:  # the manifest or one of its pages is missing
             return None
         self.store.announce(name for name, _ in sizes)
         if not all(self.store.has(name, size) for name, size in sizes):

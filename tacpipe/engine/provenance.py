@@ -24,7 +24,7 @@ from tacpipe.store.records import Environment, Processor, Provenance, RunProvena
 from tacpipe.training import devices
 
 _CPUINFO = Path("/proc/cpuinfo")
-# instruction sets by which OpenBLAS, oneDNN, torch and numpy choose kernels
+# instruction sets from which OpenBLAS, oneDNN, torch and numpy select kernels
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
 # environment variables that select kernels
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")

@@ -34,7 +34,7 @@ OPTIONS = {
 
 
 DATASETS = ("model", "split", "codec", "extend", "init")  # options that name a dataset
-_MODEL, _RESULT = "config.json", "metrics.json"  # Files of a model; an evaluation has both
+_MODEL, _RESULT = "config.json", "metrics.json"  # files of a model, and of an evaluation, which has both
 PATHS = (*DATASETS, "source")
 
 

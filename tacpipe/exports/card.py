@@ -174,7 +174,7 @@ class Params:
     """The publisher's information about the data."""
 
     title: str = "Tactile recordings"  # heading of the card and name of the dataset
-    description: str = ""  # a paragraph
+    description: str = ""  # description as one paragraph
     license: str = ""  # identifier of the licence, as cc-by-4.0
     creators: Names = ""  # people who recorded it
     url: str = ""  # address of the publication

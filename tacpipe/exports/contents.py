@@ -65,10 +65,10 @@ class ExportStream:
     recordings: Sequence[str]
     rows: int
     rates_hz: Sequence[float]  # lowest and highest rate; empty without timestamps
-    differing: Sequence[str] = ()  # recordings in which it has other columns
-    shared: Sequence[str] = ()  # columns with the same type in all of its recordings
+    differing: Sequence[str] = ()  # recordings in which the stream has other columns
+    shared: Sequence[str] = ()  # columns that have the same type in all recordings with the stream
     nan: bool = False  # whether any float is NaN
-    all_columns: Sequence[str] = ()  # columns in any of its recordings
+    all_columns: Sequence[str] = ()  # columns of the stream in any recording
 
 
 @dataclass(frozen=True)

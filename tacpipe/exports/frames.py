@@ -123,7 +123,7 @@ def add_frame_losses(
     losses = []
     for recording in recordings:
         original = originals[recording.name]
-        if set(original.streams) == {""}:  # the user synchronized it
+        if set(original.streams) == {""}:  # the user synchronized this recording before the export
             names = str(recording.attributes.get(LEFT_OUT) or "").split(", ")
             names += [channel.stream for channel in channels(recording.columns()) if channel.quantity == IMAGE]
             losses += [(recording.name, Loss(_NO_FRAMES, stream)) for stream in names if stream]

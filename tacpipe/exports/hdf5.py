@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Parts = Dataset
 
 DEMOS = "demos.hdf5"
-MASKS = {"train": "train", "val": "valid", "test": "test"}  # robomimic's name by role
+MASKS = {"train": "train", "val": "valid", "test": "test"}  # role -> robomimic's name for it
 EXTRA = "tacpipe"  # group of a demonstration with data that policies must not read
 VERSION = ("v110", "v110")  # HDF5 of 2016, which stores many small columns in half the space of older versions
 IMAGES, DERIVED = (

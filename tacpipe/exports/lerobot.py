@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the attributes are JSON
-INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # columns with indices of frames
+# columns with indices and times of frames
+INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 GROUP_FRAMES = 1 << 17  # maximum number of frames of an episode in memory; a longer episode has several row groups
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's limits
@@ -110,7 +111,8 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     names = [ACTION, "column", *STATISTICS]
     rows_of_statistics = pa.Table.from_arrays([pa.array(values) for values in zip(*rows, strict=True)], names=names)
     carried = [("", column) for feature in frame_features for column in feature.columns]
-    carried += [("", channel.name) for channel in _unsupported_channels(frames.channels(columns))]  # named above
+    # named above as unsupported
+    carried += [("", channel.name) for channel in _unsupported_channels(frames.channels(columns))]
     return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 

@@ -144,7 +144,7 @@ def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
 STATISTICS_TABLE = "stats"  # table of a part
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 STATISTICS = ("min", "max", "mean", "std", *QUANTILES)
-Stats = dict[str, dict[str, list[Any]]]  # values by channel, by statistic, by feature
+Stats = dict[str, dict[str, list[Any]]]  # feature -> statistic -> value of each channel
 
 
 def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple[str, tuple[float, ...]]]:

@@ -228,7 +228,7 @@ def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]
         t_ns = topic.t_ns
         stamps, messages = t_ns.tolist(), ros.pack_messages(topic.parts, len(t_ns))
         del topics, topic
-        if np.any(np.diff(t_ns) < 0):  # events are ordered by stream
+        if np.any(np.diff(t_ns) < 0):  # rows are not ordered by time, such as events, which are ordered by stream
             all_messages = list(messages)
             yield from ((stamps[row], channel, all_messages[row]) for row in np.argsort(t_ns, kind="stable").tolist())
         else:

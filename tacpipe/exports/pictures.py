@@ -73,7 +73,7 @@ def parameter_sets(video_format: VideoFormat) -> tuple[bytes, int]:
     extradata = video_format.extradata
     if video_format.codec not in ("h264", "hevc"):
         return b"", 0
-    if extradata[:1] != b"\x01":  # start codes
+    if extradata[:1] != b"\x01":  # the packets already have start codes
         return extradata, 0
     units: list[bytes] = []
     if video_format.codec == "h264":

@@ -104,7 +104,7 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     frame_arrays = frames.arrays_of_frames(
         frames.synchronized_columns(all_recordings[0]).select(columns), params.actions
     )
-    types: list[list[ArrayType]] = []  # by recording and array
+    types: list[list[ArrayType]] = []  # type of each array in each recording
     lengths: list[int] = []
     for recording in all_recordings:
         table = frames.synchronized_columns(recording).select(columns)

@@ -49,7 +49,8 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
                 continue
             files = files_by_slide.setdefault(recording_name(int(match[1]), int(match[2])), {})
             same = next((path for file_name, path in files.items() if file_name.endswith(f"_{match[3]}.csv")), None)
-            if same is not None:  # the same slide in two folders, or as mat3_7_bio.csv and mat03_7_bio.csv
+            # the same slide is in two folders, or has two names such as mat3_7_bio.csv and mat03_7_bio.csv
+            if same is not None:
                 raise UsageError(
                     f"{same} and {Path(folder) / name} are the same slide. Give the folder that holds one of them."
                 )

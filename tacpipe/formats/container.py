@@ -88,8 +88,8 @@ class SourceStream:
     source: str  # name in the file: a topic, a group, a dataset
     name: str  # stream name, an identifier
     time: Time
-    content: pa.Table | Batched  # all rows, or the first few in a preview
-    rows: int | None = None  # number of rows, if a preview shows it
+    content: pa.Table | Batched  # all rows, or only the first rows in a preview
+    rows: int | None = None  # number of rows, if known in a preview
 
     @property
     def schema(self) -> pa.Schema:

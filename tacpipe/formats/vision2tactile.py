@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 CLOUD, GRASP, READING = NAMES = ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
 TWIN = "duplicate_of="  # prefix of the name of an earlier grasp's file with the same reading
-UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 onwards
+UNIX_TIME = re.compile(r"[1-9]\d{9}")  # Unix time in seconds, from 2001 onwards
 VALUES = 58  # values per reading: 29 of the middle finger, then 29 of the thumb
 MAX_COUNT = 4095  # counts of a 12-bit converter
 # numbers per grasp: two points, optionally followed by the wrist's rotation matrix, row by row

@@ -30,7 +30,7 @@ SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # struct format of a length by the byte bef
 class Chunk:
     """A chunk. ``content`` follows the tag and the stream number, if there is one."""
 
-    at: int  # offset in the file
+    at: int  # offset of the chunk in the file
     tag: int
     stream: int | None
     content: bytes

@@ -325,7 +325,7 @@ def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Dra
                 os.unlink(path)  # noqa: PTH108
 
 
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:/")  # one slash, because Path("s3://bucket/x") keeps only one
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:/")  # matches one slash, because Path("s3://bucket/x") retains only one
 
 
 def local(path: Path | str) -> Path:

@@ -87,7 +87,7 @@ def _canonical(value: Any, encoder: json.JSONEncoder) -> str:
     """Return a value as canonical JSON. Raises `TacpipeError` for values that JSON cannot represent."""
     try:
         text = encoder.encode(value)
-        if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
+        if "\\ud" in text:  # characters beyond 16 bits are written as two halves, and single halves must not be joined
             json.dumps(value, ensure_ascii=False, default=encoder.default).encode()
         return text
     except (TypeError, ValueError, RecursionError) as error:

@@ -21,7 +21,7 @@ _VERSIONS = {  # files of limit and use by version, and the entry of reclaimable
     "": ("memory.max", "memory.current", "inactive_file"),
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
-AT_HAND = 1 << 26  # smaller requests are not checked
+AT_HAND = 1 << 26  # size of a request below which it is not checked
 MAX_BLOCK_BYTES = 1 << 28  # maximum unpacked size of a chunk, a page or a record of a file
 KEPT = 0.9  # fraction of the available memory that a file may declare
 SCARCE = 1 << 29  # a request that fails with more memory available than this was larger than a valid file needs
@@ -132,7 +132,7 @@ def guard() -> None:
     Otherwise their threads abort the process. Called once, before any of them is loaded.
     """
     if limited():
-        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # the other pools reserve a gigabyte at once
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # other memory pools reserve a gigabyte at once
         sys.meta_path.insert(0, _Guard())
 
 

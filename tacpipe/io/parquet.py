@@ -25,8 +25,8 @@ from tacpipe.printable import plain
 ROW_GROUP_ROWS = 1 << 20
 # fraction of repeated rows above which zstd beats delta packing; see docs/reference/recordings.md
 REPEATED_SHARE = 0.25
-LARGE_BYTES = 1 << 25  # size in memory
-BATCH_ROWS = 1024  # Arrow's default
+LARGE_BYTES = 1 << 25  # size of a table in memory above which it is written to a growing buffer
+BATCH_ROWS = 1024  # rows per batch: Arrow's default
 PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 rows could exceed the 2 GiB limit of a page
 GROUP_BYTES = 1 << 28  # encoded frames per row group
 TRIED_BYTES = 1 << 20  # encoded frames that are compressed as a trial

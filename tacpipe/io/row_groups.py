@@ -191,7 +191,7 @@ class _RowGroup:
     def clear(self) -> None:
         """Discard the rows, to start the next group."""
         self.count = self._spilled = self._bytes = 0
-        self._waiting, self._mapped = [], None  # it is unmapped with the last table that uses it
+        self._waiting, self._mapped = [], None  # the file is unmapped when the last table that uses it is freed
         for column in self._columns:
             column.values, column.valid = [], []
 
@@ -224,7 +224,7 @@ class _RowGroup:
     def _write(self, column: _SpilledColumn, values: pa.Array, row: int) -> None:
         """Write the values of a column, starting at the index ``row``, or keep a copy if they are not numbers."""
         if not column.width:
-            # a copy, so that the batch can be freed
+            # take() copies the values, so that the batch can be freed
             column.values.append(values.take(pa.array(np.arange(len(values)))))
             return
         if values.null_count:

@@ -169,7 +169,7 @@ def _rows_below(remaining: list[tuple[int, pa.Table]], order: str, limit: float 
         yield sorted_by(pa.concat_tables(ready), order)
 
 
-SEGMENT_BYTES = 1 << 28  # size of a file; few files are opened, because each needs a descriptor
+SEGMENT_BYTES = 1 << 28  # size of a file: large, because each file needs a descriptor
 MAX_READ_BYTES = 1 << 26  # number of bytes read before their pages are released
 
 

@@ -37,7 +37,7 @@ def result_json(value: Any) -> None:
 
 def note(text: object) -> None:
     """Print a note for the user on stderr, each line through `shown`."""
-    with contextlib.suppress(OSError, ValueError):  # nobody can read it any more
+    with contextlib.suppress(OSError, ValueError):  # the reader has closed the pipe
         print(printable.lines(str(text).split("\n")), file=sys.stderr, flush=True)
 
 
@@ -98,7 +98,7 @@ def unprinted() -> OSError | None:
     return None if isinstance(failure, BrokenPipeError) else failure
 
 
-WIDTH = 120  # width without a terminal
+WIDTH = 120  # width in characters if there is no terminal
 GAP = "  "
 
 
@@ -125,8 +125,8 @@ class TerminalTable:
     heads: Sequence[str]
     groups: Sequence[RowGroup]
     caption: str = ""
-    spare: Sequence[int] = ()  # columns that may be omitted, in this order
-    left: Sequence[int] = field(default=(0,))  # left-aligned text columns
+    spare: Sequence[int] = ()  # indices of columns that may be omitted on a narrow terminal, in this order
+    left: Sequence[int] = field(default=(0,))  # indices of left-aligned columns
 
     def lines(self, width: int) -> list[tuple[str, str]]:
         """Return the lines of the table with their styles, within ``width`` cells as far as `spare` allows."""

@@ -26,7 +26,7 @@ from tacpipe import printable
 from tacpipe.errors import INTERRUPTED
 from tacpipe.io import terminal
 
-GRACE_S = 0.7  # time for an orderly end
+GRACE_S = 0.7  # time allowed for ending in order
 TWICE_S = 0.25  # `timeout` signals a process and then its group: a signal this soon after a request is the same request
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -54,7 +54,7 @@ class _Program:
         self.by_main_thread = _Requests()
         self.by_listener = _Requests()
         self.ending = False
-        self.installed = False  # whether this is the process of a command
+        self.installed = False  # whether the handlers are installed, which only the process of a command does
         self.deferred = False  # whether `KeyboardInterrupt` is postponed
         self.own_way = False  # whether the command itself handles the next request
         self.sentence = SENTENCE
@@ -153,7 +153,7 @@ def finish(code: int) -> int:
     An interrupted process ends here, because unloading torch and other libraries would take another second.
     """
     if code == INTERRUPTED:
-        with contextlib.suppress(OSError, ValueError):  # nobody reads the output
+        with contextlib.suppress(OSError, ValueError):  # the reader of the output has closed it
             sys.stdout.flush()
         _program.end()
     _program.code = code

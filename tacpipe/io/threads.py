@@ -28,7 +28,7 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item], at_onc
     try:
         for item in items:
             waiting.append(pool.submit(work, item))
-            if len(waiting) > 4 * at_once:  # a slow item does not delay those after it
+            if len(waiting) > 4 * at_once:  # a slow item must not delay the items after it
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -70,7 +70,7 @@ class CameraLink(OpenLink):
         matrix = np.asarray(metadata.intrinsics.intrinsic_matrix)
         self._focal = float(matrix[0, 0]), float(matrix[1, 1])
         self._centre = float(matrix[0, 2]), float(matrix[1, 2])
-        self._unit_m = 1 / float(metadata.depth_scale)  # RealSense reports counts per metre
+        self._unit_m = 1 / float(metadata.depth_scale)  # RealSense reports counts per metre, not metres per count
 
     def _receive(self, timeout_s: float) -> Arrived:
         """Return the next image as a depth frame, or nothing after ``timeout_s``.

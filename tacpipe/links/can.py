@@ -197,7 +197,7 @@ class CanLink(OpenLink):
         try:
             self.bus.shutdown()
         except (can.CanError, OSError, ValueError, termios.error):  # an unplugged adapter does not reply
-            port = getattr(self.bus, "serialPortOrig", None)  # slcan does not close its serial port in this case
+            port = getattr(self.bus, "serialPortOrig", None)  # slcan leaves its serial port open after such an error
             if port is not None:
                 with contextlib.suppress(OSError):
                     port.close()

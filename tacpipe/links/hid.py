@@ -15,7 +15,7 @@ from tacpipe.links.ports import HidInterface
 from tacpipe.sensors.sensor import Sensor
 
 MAX_WAIT_S = 0.03  # the kernel queues 63 reports, 63 ms of the fastest device, and then drops the newest
-KEYS = ("interface", "usage_page", "serial")  # keys after the ? of an address
+KEYS = ("interface", "usage_page", "serial")  # keys that may follow the ? of an address
 LONG = 0xFE  # prefix of a long item; the next byte is its size
 INPUT, USAGE_PAGE, REPORT_SIZE, REPORT_ID, REPORT_COUNT, PUSH, POP = 0x80, 0x04, 0x74, 0x84, 0x94, 0xA4, 0xB4
 

@@ -29,7 +29,7 @@ SCHEMES = {
     "mjpeg": "mjpeg:http://192.168.1.20:8080/stream",
     "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
-MAX_LENGTH = 4096  # characters of a target, the limit of a path
+MAX_LENGTH = 4096  # maximum number of characters of a target, which is the limit of a path
 Arrived = list[tuple[int, bytes]]  # (arrival on the monotonic clock in ns, bytes)
 
 WRITE_S = 5.0  # a device that accepts no byte for this time is gone
@@ -104,7 +104,7 @@ class OpenLink:
     packets = False  # True if each entry of `read` is one packet
 
     def __init__(self, name: str) -> None:
-        self.name = name  # stream and address, for errors
+        self.name = name  # stream and address, as named in errors
         self._closed = False
         self._closing, self._reading, self._writing = threading.Lock(), threading.Lock(), threading.Lock()
 
@@ -178,7 +178,7 @@ class OpenLink:
         """Release the resources of the link."""
 
 
-MAX_READ = 1 << 16  # bytes per read
+MAX_READ = 1 << 16  # maximum number of bytes per read
 
 
 class DescriptorLink(OpenLink):

@@ -64,7 +64,7 @@ def open_lsl(target: str, sensor: Sensor, name: str) -> LslLink:
 def silence_logging(pylsl: Any) -> None:
     """Turn off liblsl's messages on the terminal, unless a user's configuration file exists."""
     if not os.environ.get("LSLAPICFG") and not any(path.expanduser().is_file() for path in CONFIG_FILES):
-        pylsl.util.set_config_content(SILENT_CONFIG)  # has no effect if LSL was already used in this process
+        pylsl.util.set_config_content(SILENT_CONFIG)  # this has no effect if LSL was already used in this process
 
 
 def _parse_query(target: str) -> Mapping[str, str]:

@@ -15,7 +15,7 @@ from tacpipe.sensors.camera import Frame, pack_frame, pack_settings
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.video.images import read_shape
 
-MAX_HEAD_BYTES = 1 << 14  # limit of the head of a response or of an image
+MAX_HEAD_BYTES = 1 << 14  # maximum size of the head of a response or of an image
 MAX_IMAGE_BYTES = 1 << 25
 READ_BYTES = 1 << 18
 ANSWER_S = 5.0  # timeout for the head of the response

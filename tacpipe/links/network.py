@@ -81,11 +81,11 @@ def connection_error(error: OSError, host: str, port: int, name: str) -> DeviceE
 MAX_DATAGRAM = 1 << 16  # bytes
 QUEUE_BYTES = 8 << 20  # requested size of the kernel's receive queue
 LINGER_S = 0.005  # wait after the first datagram, to fetch several at once; the kernel has stamped them
-LIVE_LINGER_S = 0.001  # the same wait for live consumers
+LIVE_LINGER_S = 0.001  # the same wait if live consumers receive the data
 STAMPS, DROPS = 35, 40  # SO_TIMESTAMPNS and SO_RXQ_OVFL of <asm-generic/socket.h>, which Python does not define
 FORCED_QUEUE = 33  # SO_RCVBUFFORCE of the same header
 FIRST = "first"  # option value: accept only the sender of the first datagram
-MAX_FETCHED = 16_384  # datagrams per fetch
+MAX_FETCHED = 16_384  # maximum number of datagrams per fetch
 ANCILLARY_BYTES = 128  # buffer size for both ancillary messages
 
 
@@ -214,7 +214,7 @@ class UdpLink(DescriptorLink):
     def _receive(self, timeout_s: float) -> Arrived:
         """Return the datagrams that arrived within ``timeout_s``. Raises a `LinkLostError` of an earlier read."""
         entries = super()._receive(timeout_s) if self._failed is None else []
-        if self._failed is not None and not entries:  # otherwise the next read reports the loss
+        if self._failed is not None and not entries:  # if there are entries, the next read reports the loss
             failed, self._failed = self._failed, None
             raise failed
         return entries
@@ -255,7 +255,7 @@ class UdpLink(DescriptorLink):
         """Return whether datagrams of a sender are accepted; the first sender becomes the only one for `FIRST`."""
         if not self._accepted_sender:
             return True
-        host = str(sender[0]).partition("%")[0]  # without the interface of a link-local address
+        host = str(sender[0]).partition("%")[0]  # the part before %, without the interface of a link-local address
         if self._accepted_sender == FIRST:
             self._accepted_sender = host
         return host == self._accepted_sender

@@ -34,7 +34,7 @@ def open_link(address: Address, sensor: Sensor, stream: str) -> Link:
     return OPENERS[address.scheme](address.target, sensor, f"Stream {stream} ({address})")
 
 
-QUOTED = 16  # bytes that an error quotes
+QUOTED = 16  # maximum number of bytes that an error quotes
 
 
 class NoReplyError(DeviceError):

@@ -167,7 +167,7 @@ def _open_files(process: Path) -> set[str]:
         for file in (process / "fd").iterdir():
             try:
                 targets.add(str(file.readlink()))
-            except OSError:  # closed meanwhile
+            except OSError:  # the process has closed it in the meantime
                 continue
     except OSError:  # another user's process, or one that has ended
         return targets
@@ -247,7 +247,7 @@ def _open_port(target: str, baud: int, line: SerialLine, name: str) -> serial.Se
 
 def _cause(error: OSError) -> OSError:
     """Return the system error that caused an error of pyserial, or the error itself if there is none."""
-    cause = error.__context__  # an OSError or a termios.error, which is not an OSError
+    cause = error.__context__  # either an OSError or a termios.error, which is not an OSError
     number = cause.args[0] if cause is not None and cause.args else None
     return OSError(number, os.strerror(number)) if isinstance(number, int) else error
 

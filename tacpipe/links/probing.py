@@ -31,7 +31,7 @@ MIN_FRAMES = 3
 class SensorCandidate:
     """A sensor that may have sent the bytes, with its options."""
 
-    kind: str  # registered name
+    kind: str  # registered name of the sensor
     sensor: Sensor
     options: Options = field(default_factory=dict)
 

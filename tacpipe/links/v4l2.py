@@ -45,7 +45,7 @@ CONTROLS = {  # by option: its control, the automatic control that must be off, 
     "exposure": (EXPOSURE, EXPOSURE_AUTO, MANUAL_EXPOSURE),
     "gain": (GAIN, AUTO_GAIN, 0),
     "white_balance_k": (WHITE_BALANCE, AUTO_WHITE_BALANCE, 0),
-    "led": (ZOOM, None, 0),  # a DIGIT has its light there
+    "led": (ZOOM, None, 0),  # a DIGIT controls its light by the zoom
 }
 
 BUFFER = struct.Struct("<IIIII4xqq16sIIQIIi4x")  # v4l2_buffer
@@ -257,7 +257,7 @@ def _set_controls(device: V4l2Device, sensor: Any, encoding: str) -> str:
         if value is None:
             continue
         if automatic_control is not None:
-            with contextlib.suppress(OSError):  # many cameras lack the automatic control
+            with contextlib.suppress(OSError):  # many cameras do not have the automatic control
                 device.write_control(automatic_control, off_value)
         try:
             device.write_control(control, value)
@@ -366,7 +366,7 @@ class V4l2Link(DescriptorLink):
     def _release(self) -> None:
         """Stop the capture, and close buffers and device."""
         super()._release()
-        with contextlib.suppress(OSError):  # it was unplugged
+        with contextlib.suppress(OSError):  # the camera was unplugged
             self.device.call(STREAMOFF, struct.pack("<i", CAPTURE))
         for memory in self._memory:
             memory.close()

@@ -18,7 +18,7 @@ from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
-SETTLE_NS = 2_000_000  # time after a row's time in which its samples may still arrive from other threads
+SETTLE_NS = 2_000_000  # duration after a row's time in which its samples may still arrive from other threads
 
 
 class Continuation(Protocol):

@@ -28,8 +28,8 @@ class Message:
 
     declaration: ClassVar[Declaration]
     seq: int
-    t_ns: int  # time that it refers to, in the recording's UTC
-    cause: str  # why there is no result, or what input it lacks
+    t_ns: int  # time that the message refers to, in the recording's UTC
+    cause: str  # why there is no result, or which input is missing
     made_from_t_ns: int  # arrival time of the newest sample used
     latency_ms: float
     skipped: int

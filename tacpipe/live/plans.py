@@ -104,7 +104,7 @@ class PosePlan(NamedTuple):
     """Planned poses of the hand: times, and positions in m with quaternions x, y, z, w."""
 
     t_ns: Times  # (point,), ascending
-    poses: Floats  # (point, 7); the hand does not turn if a quaternion is not finite
+    poses: Floats  # (point, 7), position and quaternion; the hand does not turn if a quaternion is not finite
 
 
 class PlanHistory:

@@ -33,7 +33,7 @@ SWITCH_S = 0.0005  # maximum time that a publisher's thread delays an answer
 MAX_WAIT_S = 0.02
 REFUSED = 2  # exit code if the session cannot start with this model and rig
 SHORTEST_MS, LONGEST_MS = 0.01, 100_000.0
-PER_DECADE = 100  # bins per decade; quantiles are accurate to 2.3 %
+PER_DECADE = 100  # number of bins per decade of latency; quantiles are accurate to 2.3 %
 BINS = PER_DECADE * round(math.log10(LONGEST_MS / SHORTEST_MS))
 
 
@@ -208,7 +208,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     send_line(connection, {"ready": True})
     from tacpipe.models.tensors import one_thread  # imports torch, which the engine has already loaded
 
-    with publishers, one_thread():  # set once, not in each forecast
+    with publishers, one_thread():  # the number of threads is set once, not in each forecast
         Loop(connection, engine, publishers, wire.Blocks(options.streams)).run()
     return 0
 

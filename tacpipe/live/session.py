@@ -27,8 +27,8 @@ from tacpipe.recording.spool_folders import ClockReading
 from tacpipe.sensors.framing import Chunks
 
 MODULE = "tacpipe.live.process"  # module run as the model's process
-RESTART_S = (0.5, 10.0)  # wait between its end and the next start: first and maximum
-STOP_S = 5.0  # time for the process to end and close its publishers
+RESTART_S = (0.5, 10.0)  # wait between the end of a model's process and the next start: first and maximum
+STOP_S = 5.0  # timeout for the process to end and close its publishers
 LOOK_S = 0.05
 Counted = Literal["forecasts", "skipped", "late", "dropped"]  # figures that add up over processes
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
@@ -141,7 +141,7 @@ class Supervisor:
         """End the recording; data until the next one are not predicted."""
         self._offset_ns = None
         if self.options.settings.realtime:
-            wire.ordinary()  # decoding and writing have no deadline
+            wire.ordinary()  # this thread decodes and writes, which has no deadline
         self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[StreamNote]:
@@ -160,7 +160,7 @@ class Supervisor:
             self._restart_s = min(2 * self._restart_s, RESTART_S[1])
             notes.append(StreamNote(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
         if self._process is None and clock.now_s() >= self._due_s:
-            with contextlib.suppress(OSError):  # too little memory: try again later
+            with contextlib.suppress(OSError):  # there is too little memory for a process now: try again later
                 self._spawn()
                 notes.append(
                     StreamNote(clock.now_ns(), self._noted_stream, RESTARTED, f"restart {self.deaths} of this session")
@@ -248,7 +248,8 @@ class Supervisor:
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
                 elif "beginning" in content:
-                    if content["offset_ns"] == self._offset_ns:  # otherwise it belongs to the previous recording
+                    # a report with another offset belongs to the previous recording
+                    if content["offset_ns"] == self._offset_ns:
                         self._beginning = content["beginning"]
                 elif "report" in content:
                     self.report = content["report"]

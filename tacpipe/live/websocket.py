@@ -26,11 +26,11 @@ from tacpipe.printable import excerpt
 
 HOST = "127.0.0.1"  # default host of the server
 TOKEN = "TACPIPE_LIVE_TOKEN"  # variable of the environment; subscribers must send its value unless it is empty
-CONNECTIONS = 32  # open at a time, subscribed or not
+CONNECTIONS = 32  # maximum number of open connections, subscribed or not
 QUEUED = 16  # messages queued per subscriber; a third of a second at 50 Hz
-QUEUED_BYTES = 1 << 20  # limit of their size
+QUEUED_BYTES = 1 << 20  # maximum size of the messages queued per subscriber
 SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
-BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
+BEHIND = 100  # number of successive dropped messages after which a subscriber is disconnected
 # bytes that a client may send: for its request, then per second
 RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
 # The page comes from one file, and connects to its own server only.
@@ -42,8 +42,8 @@ PAGE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
-OPEN_S = 2.0  # limit of a handshake
-END_S = 1.0  # limit of closing all connections
+OPEN_S = 2.0  # timeout of a handshake
+END_S = 1.0  # timeout for closing all connections
 SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that disconnects is not an error
 SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
@@ -72,7 +72,7 @@ class WebsocketPublisher:
         self._about = to_json(about.to_dict()).decode()
         self._token = os.environ.get(TOKEN, "")
         self._connections: set[ServerConnection] = set()
-        self._subscribers: dict[ServerConnection, int] = {}  # messages in a row that each missed
+        self._subscribers: dict[ServerConnection, int] = {}  # number of successive messages that each subscriber missed
         listening = _listening_socket(target)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="websocket", daemon=True)
@@ -189,7 +189,9 @@ def _listening_socket(target: str) -> socket.socket:
         listening = socket.create_server(address, family=family)
     except OSError as error:
         raise DeviceError(f"--publish ws:{target}: {error.strerror or error}. Take another port.") from error
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SENDING_BYTES)  # connections inherit it
+    listening.setsockopt(
+        socket.SOL_SOCKET, socket.SO_SNDBUF, SENDING_BYTES
+    )  # connections inherit the size of this buffer
     return listening
 
 

@@ -31,9 +31,9 @@ from tacpipe.sensors.framing import Chunks
 CLOCK = "clock"  # note on all streams: offset in ns from the monotonic clock to the recording's UTC
 BEGIN = "begin"  # start of a recording; the data of each stream follow its own note
 CONTINUE = "continue"  # precedes BEGIN: the state from which a new process continues
-END = "end"  # the recording ends
+END = "end"  # end of a recording
 OVERFLOW = "overflow"  # blocks were dropped because the model's process did not read them
-STOP = "stop"  # the session ends
+STOP = "stop"  # end of the session
 QUEUED_BYTES = 8 << 20  # maximum size of the queue, enough for many seconds of a rig
 
 

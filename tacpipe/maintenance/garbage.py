@@ -28,9 +28,9 @@ from tacpipe.store import layout, presence
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
-GRACE_DAYS = 14.0  # how long a root with an unreachable path, and a file in quarantine, is retained
-_DRAFT_S = 3600.0  # older drafts are abandoned
-_YOUNG_S = 60.0  # younger files are not touched
+GRACE_DAYS = 14.0  # how long roots with unreachable paths and files in quarantine are retained
+_DRAFT_S = 3600.0  # age in seconds above which a draft counts as abandoned
+_YOUNG_S = 60.0  # age in seconds below which files are not touched
 
 
 @dataclass
@@ -187,7 +187,7 @@ def _remove(store: Store, moved_names: list[str], needed: set[str], collected: C
     """Remove the objects that were moved aside, except those that are needed again."""
     for name in moved_names:
         if name in needed:
-            store.has(name)  # this puts it back
+            store.has(name)  # `has` moves the object back
             continue
         path = store.aside_path(name)
         _count(collected, path)
@@ -250,7 +250,7 @@ def _closure(
         except StorageError:  # the disk failed or memory is short, so the manifest's content is unknown
             raise
         except TacpipeError as error:
-            if name in datasets or store.quarantined(name) or store.has(name):  # it existed here once
+            if name in datasets or store.quarantined(name) or store.has(name):  # the manifest existed here once
                 raise DamagedError(
                     f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
                     "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
@@ -345,12 +345,14 @@ def _sweep(
     for path in layout.entries(store.root, "tmp"):
         if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
             continue
-        dead = path.name.startswith("run-")  # its run has ended; a draft without a run is removed when it is old
+        # the run of such a draft has ended; a draft without a run is removed when it is old
+        dead = path.name.startswith("run-")
         with contextlib.suppress(FileNotFoundError):
             old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
             collected.drafts += old and _drop(path, dry_run=dry_run)
     for path in layout.entries(store.root, "quarantine"):
-        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400  # since it was quarantined
+        # whether it was quarantined long enough ago
+        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400
         if old and (doubtful or path not in needed.doubtful):
             _drop(path, dry_run=dry_run)
     if not dry_run:

@@ -192,4 +192,4 @@ def _remove_manifest(store: AnyStore, root: Root, manifest: str) -> None:
     if newest is not None:
         reduced: Root = {**root, "manifest": newest["manifest"], "written_s": newest.get("written_s", 0)}
         store.roots.write({**reduced, "previous": earlier[0]["manifest"] if earlier else None, "history": earlier})
-    store.roots.remove(root)  # the root that was just written is another one
+    store.roots.remove(root)  # the root that was just written has another key, so the old one is removed

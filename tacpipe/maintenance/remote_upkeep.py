@@ -32,7 +32,7 @@ from tacpipe.store.remote import SNAPSHOTS, RemoteStore
 from tacpipe.store.store import AbsentError, MissingError
 
 Item = TypeVar("Item")
-MANIFEST = b"{\n"  # how every manifest begins, and no Parquet file
+MANIFEST = b"{\n"  # first bytes of every manifest, but of no Parquet file
 _DAY_S = 86400.0
 
 
@@ -40,7 +40,7 @@ _DAY_S = 86400.0
 class _Needed:
     """Everything that roots and announcements need, with all that it descends from."""
 
-    objects: set[str] = field(default_factory=set)  # digests, of manifests too
+    objects: set[str] = field(default_factory=set)  # digests of objects, including manifests
     manifests: set[str] = field(default_factory=set)
     recorded: list[Manifest] = field(default_factory=list)  # manifests of recordings
 

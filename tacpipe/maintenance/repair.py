@@ -210,7 +210,7 @@ def _rewrite_manifest(store: Store, root: Root) -> list[str]:
     try:
         manifest_of.find(path).manifest  # noqa: B018  (is it sound?)
         return []
-    except StorageError:  # it may be intact
+    except StorageError:  # the system failed to read it, so it may be intact
         return []
     except TacpipeError:
         pass
@@ -241,7 +241,7 @@ def link(path: Path) -> int:
                 and file_digest(shard_path) == digest
             )
             if not (matches and store.has(digest)):
-                read(digest, name)  # repairs the store first
+                read(digest, name)  # reading repairs the store first
             if not matches:
                 stale.append((name, digest))
         directory_of.refuse_links(directory, [name for name, _ in stale])

@@ -22,7 +22,7 @@ from tacpipe.store.records import Record
 from tacpipe.store.store import Store
 
 NOTE = hashlib.sha256(b"sound records").hexdigest()  # name of the file among the notes on directories
-PAGES_NOTE = hashlib.sha256(b"sound pages").hexdigest()  # the same for pages
+PAGES_NOTE = hashlib.sha256(b"sound pages").hexdigest()  # name of the file for pages
 NOTES = (NOTE, PAGES_NOTE)
 _FORMAT = b"1"
 _FEWEST = 1000  # minimum number of records; fewer are parsed about as fast as the cache is read
@@ -32,7 +32,7 @@ class RecordSummary(NamedTuple):
     """The properties of a record that a collection needs; those of all records are in memory."""
 
     names: str  # digests of shards and files
-    irreplaceable: bool  # no stage can compute the result again
+    irreplaceable: bool  # whether no stage can compute the result again
 
 
 class SoundRecords:
@@ -69,7 +69,7 @@ class SoundRecords:
         _write_lines(self._store, self._path, (b"%b %b\n" % line for line in self._lines.items()))
 
 
-_SHARD_DIGEST = re.compile(rb'"digest":"([0-9a-f]{64})"')  # of a shard in a page, which is canonical JSON
+_SHARD_DIGEST = re.compile(rb'"digest":"([0-9a-f]{64})"')  # digest of a shard in a page, which is canonical JSON
 
 
 class SoundPages:
@@ -79,7 +79,7 @@ class SoundPages:
         self._store = store
         self._path = store.root / layout.PRESENCE / PAGES_NOTE
         self._remembered = set(_read_lines(self._path))
-        self._statements: set[bytes] = set()  # digests of what roots state of the pages that were read
+        self._statements: set[bytes] = set()  # digests of the entries of checked pages in roots
 
     def names(self, pages: Pages, number: int) -> set[str]:
         """Return the digests of the shards that a page names. Raises the errors of `Pages.load`."""

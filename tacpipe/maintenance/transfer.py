@@ -25,7 +25,7 @@ from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import Root, RootProject, project_id
 from tacpipe.store.store import Store
 
-_LOOKS = 100  # attempts if other pushes of the same name come first
+_LOOKS = 100  # maximum number of attempts if other pushes of the same name come first
 
 
 def named_store(remote: Path | str) -> AnyStore:
@@ -55,7 +55,7 @@ def remote_store(remote: Path | str) -> AnyStore:
         ) from None
     except regular.IrregularError as error:
         raise UsageError(f"{remote} is not a store: {error}") from None
-    store.prepare()  # raises for another format
+    store.prepare()  # raises an error if the store has another format
     return store
 
 

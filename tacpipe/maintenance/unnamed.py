@@ -66,7 +66,7 @@ def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterabl
             if new_possessions:
                 object_digests = {digest for _, digest in manifest.objects()}
                 candidates[is_page].append(_Candidate(name, new_possessions, object_digests))
-        except MissingPageError:  # it may have contained anything
+        except MissingPageError:  # a missing page may have contained anything
             names[name] = manifest.reached({}, lenient=True)
     retained: set[tuple[object, ...]] = set()
     for is_page in (False, True):  # manifests come before pages

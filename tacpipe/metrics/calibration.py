@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COVERAGE_FILE = "coverage.parquet"  # the coverage of a calibrated model's bands, for `measure_bands`
-BINS = 10  # bins of confidence, equally wide
+BINS = 10  # number of equally wide bins of confidence
 MIN_PROBABILITY = 1e-12
 RANGE = 8.0  # range of the logarithm of a temperature, relative to the spread of scores
 
@@ -153,7 +153,7 @@ class Sums:
     pinball: AnyFloats  # (step, level), counts
     below: AnyFloats  # (step, level), true values at or below the quantile
     covered: AnyFloats  # (step,), true values in the band from the lowest to the highest quantile
-    width: AnyFloats  # (step,), of that band, counts
+    width: AnyFloats  # (step,), width of that band in counts
     values: AnyFloats  # (step,)
 
     @classmethod
@@ -236,7 +236,7 @@ class Band:
     values: int
     clusters: int
     coverage: Estimate
-    width: float  # mean, in the unit of the values
+    width: float  # mean width, in the unit of the values
     pinball: float  # mean loss, in the unit of the values
     gain: Estimate  # 1 - pinball / pinball of the baseline
 

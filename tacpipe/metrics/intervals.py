@@ -87,7 +87,7 @@ def student_quantile(freedom: float, level: float) -> float:
         return math.nan
     scale = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(math.pi)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    # a wider range would miss a narrow peak
+    # a wider range would make the integration miss a narrow peak
     low, high = 0.0, math.atan((10 if freedom > 30 else 200) / math.sqrt(freedom))
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
@@ -125,9 +125,9 @@ def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None =
     )
     if seeds > 1:
         seed_variance = _variance(_influences(statistic, total, sums.sum(axis=1)))
-        if seeds == 2:  # otherwise, intervals cover less than 92 %
+        if seeds == 2:  # without this correction, intervals cover less than 92 %
             seed_variance = 2 * seed_variance
-        # it is part of both variances
+        # the variance of cells is part of both variances
         seed_variance = np.maximum(seed_variance - _variance_of_cells(statistic, total, sums), 0)
         total_variance = variance + seed_variance
         shares = np.square(variance) / freedom + np.square(seed_variance) / (seeds - 1)
@@ -269,8 +269,8 @@ class Difference(NamedTuple):
     """The result of a paired test of second minus first."""
 
     difference: float  # mean over pairs, in the unit of the values
-    t: float  # infinite if all pairs have the same difference, NaN if it is 0
-    p: float  # two-sided, or NaN if no pair differs
+    t: float  # t statistic: infinite if all pairs have the same difference, NaN if that is 0
+    p: float  # two-sided p value, or NaN if no pair differs
 
 
 def wilson(correct: int, n: int) -> tuple[float, float]:

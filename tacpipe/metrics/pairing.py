@@ -21,7 +21,8 @@ from tacpipe.metrics.headline import Headline, HeadlineRow, verdict_of
 from tacpipe.metrics.intervals import Estimate, Interval, Jackknife
 
 Sums = Mapping[tuple[Hashable, str], AnyFloats]  # (seed, recording) -> sums (part,), which can be added over recordings
-MAX_ENUMERATED, SWAPS = 12, 9_999  # maximum number of clusters for all permutations; number of random ones for more
+# maximum number of clusters for all permutations; number of random permutations for more clusters
+MAX_ENUMERATED, SWAPS = 12, 9_999
 Key = TypeVar("Key", bound=Hashable)
 
 
@@ -60,7 +61,7 @@ class Gain:
     mean: float
     low: float
     high: float
-    clusters: int = 0  # units that were omitted one by one
+    clusters: int = 0  # number of units that the jackknife omitted one by one
     effective: float = 0.0  # effective number of clusters
 
     @property

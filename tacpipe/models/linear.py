@@ -95,7 +95,7 @@ class FittedBaselines:
 
     mean_count: AnyFloats  # (channel,)
     phi: float
-    lag: int  # rows, or 0 if the context is a single frame, which has no trend
+    lag: int  # number of rows of the trend; 0 if the context is a single frame
     shared_weight: AnyFloats  # (context - 1, horizon)
     shared_bias: AnyFloats  # (horizon,), counts
     ridge: AffineMap
@@ -238,7 +238,7 @@ class _FeatureSums:
 class _SharedSums:
     """The same sums for features that all channels share: over windows and channels, nothing taken off."""
 
-    count: int  # windows x channels
+    count: int  # number of windows times number of channels
     x: AnyFloats  # (context - 1,)
     y: AnyFloats  # (horizon,)
     xx: AnyFloats  # (context - 1, context - 1)

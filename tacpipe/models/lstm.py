@@ -89,7 +89,7 @@ def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lea
     """Return the result of `lstm`, computed by torch's layer: by cuDNN on a GPU, and fastest on a CPU without gradients."""
     from_input, from_state, bias = weights
     all_inputs = inputs
-    if lead is not None:  # zero after the first step
+    if lead is not None:  # these inputs are zero after the first step
         lead_inputs = torch.cat([lead[0][None], lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)])
         all_inputs = torch.cat([lead_inputs, inputs], dim=-1)
         from_input = torch.cat([lead[1], from_input], dim=1)

@@ -28,7 +28,8 @@ from tacpipe.models.readout import Readout
 from tacpipe.models.tensors import tensors_under
 
 LENGTH = 9  # weights per kernel
-HEAVY_POSITIONS = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): positions of the weights 2
+# (kernel, 3): positions of the weights equal to 2
+HEAVY_POSITIONS = np.array(list(itertools.combinations(range(LENGTH), 3)))
 KERNELS = len(HEAVY_POSITIONS)  # 84
 MAX_DILATIONS = 32  # maximum number of dilations per kernel
 MAX_CHANNELS = 9  # maximum number of channels that a kernel sums
@@ -214,7 +215,7 @@ def _validate_slides(x: AnyFloats) -> None:
         raise TacpipeError("Some slides contain values that are not finite. Segment them again, or exclude these.")
 
 
-QUANTILES = (0.5, 0.75, 0.9, 1.0)  # over the channels at each moment
+QUANTILES = (0.5, 0.75, 0.9, 1.0)  # quantiles over the channels at each moment
 # candidate weights of strength, relative to 1 for patterns; a finer grid would select it by chance
 STRENGTH_WEIGHTS = (0.0, 0.3, 1.0)
 
@@ -233,7 +234,7 @@ class MinirocketClassifier:
     ANY_LENGTH: ClassVar[bool] = False  # True: also reads slides with fewer frames than in training
     patterns: Rocket
     readout: Readout
-    share: float  # weight of strength; patterns have 1
+    share: float  # weight of strength, relative to 1 for patterns
 
     @classmethod
     def fit(cls, x: AnyFloats, labels: Ints, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:

@@ -172,8 +172,8 @@ class AutoencoderShape:
     decoder: str = "D1"  # D1: the latents are the decoder's initial state; D2: they are its input at every step
     hidden: int = HIDDEN
     latents: int = LATENTS
-    unpool: str = "nearest"  # reverses the pooling of a cnn: nearest, or last as in the published code
-    dropout: float = 0.0  # of the latents, or last states, before the classifier
+    unpool: str = "nearest"  # how the pooling of a cnn is reversed: nearest, or last as in the published code
+    dropout: float = 0.0  # dropout of the latents, or last states, before the classifier
 
 
 class NetworkOutput(NamedTuple):

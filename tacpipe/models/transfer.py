@@ -205,7 +205,7 @@ BANDS = 16
 MIN_PERIODS = 3.0
 MAX_FREQUENCY_FRACTION = 0.6  # maximum frequency as a fraction of the Nyquist frequency, to avoid aliasing
 LINES_PER_BAND = 4  # number of spatial frequencies per band
-# fraction of the channels that is used, those with the highest level; others may not be in contact
+# fraction of the channels that are used: those with the highest level, because others may not be in contact
 LEADING_FRACTION = 0.3
 HOP = 0.25  # distance between windows, as a fraction of their length
 ROUNDING_POWER = 1 / 12  # counts^2, noise power of rounding to integers: no spectrum is below it

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-MOTION, UP = 15, 3  # columns of the motion and of the up direction, as a plain network reads them
+MOTION, UP = 15, 3  # numbers of columns of the motion and of the up direction that a plain network reads
 POSE = 7  # columns of ``arm`` with position and quaternion; velocity follows
 ARM = 13
 

@@ -66,7 +66,7 @@ def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> Mi
     ``plugin`` is the package that provides ``needed_by``, for modules that are not in tacpipe's own extras.
     """
     module = (error.name or "").partition(".")[0]
-    if not module or module in OWN or module in sys.modules:  # a mistake in the importing module
+    if not module or module in OWN or module in sys.modules:  # the error is in the importing module itself
         return None
     extra, absent = extra_for(module), isinstance(error, ModuleNotFoundError) and not _is_installed(module)
     if extra is None:
@@ -133,7 +133,7 @@ class StageFailure(TypedDict):
 
     stage: str
     recording: str
-    frames: str  # of the traceback
+    frames: str  # frames of the traceback
 
 
 def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:

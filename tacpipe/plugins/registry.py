@@ -149,9 +149,9 @@ def _top_modules(entry_points_file: Path | None) -> set[str]:
         target for points in installed().values() for target, file in points.values() if file == entry_points_file
     )
     modules = {target.partition(":")[0].partition(".")[0] for target in targets}
-    with contextlib.suppress(OSError):  # written by setuptools only
+    with contextlib.suppress(OSError):  # only setuptools writes this file
         modules.update(entry_points_file.with_name("top_level.txt").read_text(encoding="utf-8").split())
-    with contextlib.suppress(OSError):  # absent from an egg-info
+    with contextlib.suppress(OSError):  # an egg-info folder has no such file
         paths = [line.split(",")[0] for line in entry_points_file.with_name("RECORD").read_text("utf-8").splitlines()]
         modules.update(path.partition("/")[0].removesuffix(".py") for path in paths if path.endswith(".py"))
     return {module for module in modules if module.isidentifier()}
@@ -424,7 +424,7 @@ def _import(name: str, target: str) -> Any:
         raise extras.missing(error, name, _package(target)) or TacpipeError(sentence) from error
     except TacpipeError:
         raise
-    except Exception as error:  # a mistake in the plug-in's module
+    except Exception as error:  # the plug-in's module raises an error
         raise TacpipeError(f"The module {module} of {name} cannot be loaded. {extras.failure_line(error)}") from error
     try:
         return operator.attrgetter(attribute)(loaded) if attribute else loaded

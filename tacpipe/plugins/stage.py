@@ -150,7 +150,7 @@ class Stage(Generic[P, R]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function with the streams that its params select, without a store."""
         params: Any = args[0] if args else kwargs.get("params")
-        if not hasattr(params, "narrow"):  # a `StreamSelection`
+        if not hasattr(params, "narrow"):  # only a `StreamSelection` has this method
             return self.function(*args, **kwargs)
         bound = inspect.signature(self.function).bind(*args, **kwargs)
         if name := self.argument("Recording"):
@@ -278,7 +278,7 @@ def stage(
     )
 
 
-REQUIREMENT_WIDTH = 110  # characters per line
+REQUIREMENT_WIDTH = 110  # maximum number of characters per line
 
 
 @dataclass(frozen=True)

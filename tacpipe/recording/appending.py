@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-BYTES = "bytes"  # name of the attached spool, which is stored if a driver could not decode all bytes
+BYTES = "bytes"  # name of the attached raw bytes, which are stored if a driver could not decode all of them
 RIG = "rig.toml"  # name of the attached rig file
 
 
@@ -84,7 +84,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
         try:
             manifest_of.check_pages(updated, fresh=True)
             updated.content  # noqa: B018  (raises if a value cannot be written as JSON)
-        except (ValueError, TypeError, KeyError) as error:  # never publish a manifest that readers reject
+        except (ValueError, TypeError, KeyError) as error:  # a manifest that readers would reject must not be published
             raise TacpipeError(
                 f"Recording {plain(name)} cannot be added to {path}: {plain(str(error), 200)}."
             ) from error

@@ -57,7 +57,7 @@ class Pace:
     def __init__(self, now_ns: int, suspended_ns: int) -> None:
         self._catching_up = False  # True while queued bytes are read after a stall
         self._empty_ns = now_ns  # last time at which the link was empty
-        self._suspended_ns = suspended_ns  # total since boot
+        self._suspended_ns = suspended_ns  # total time of suspension since boot, in ns
         self._stall_end_ns = 0  # end of the last stall
 
     def resume(self, now_ns: int) -> None:

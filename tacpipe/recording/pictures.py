@@ -24,7 +24,7 @@ HOSTS = (
     "localhost",
 )  # accepted host names, so that a page of another site cannot read the images through its own name
 POLL_S = 0.01  # period of looking for a new frame
-IDLE_S = 0.2  # maximum time without a frame after which the last one is sent again, which shows that a browser left
+IDLE_S = 0.2  # time without a new frame after which the last one is sent again, to detect that a browser disconnected
 BOUNDARY = "tacpipe-frame"
 STYLE = (
     "body{background:#111;color:#ddd;font:16px sans-serif}figure{display:inline-block}img{width:640px;max-width:95vw}"
@@ -102,7 +102,7 @@ class PictureHandler(BaseHTTPRequestHandler):
         self.end_headers()
         sent: bytes | None = None
         idle_s = 0.0
-        with contextlib.suppress(OSError):  # the browser left
+        with contextlib.suppress(OSError):  # the browser has disconnected
             while not self.stopping.is_set():
                 frame = watch.newest_packet
                 is_new = frame is not None and frame is not sent

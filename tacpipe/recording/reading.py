@@ -15,7 +15,7 @@ from tacpipe.arrays import AnyArray, Bools, Int64s, Times
 from tacpipe.sensors.framing import Account, Chunks, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Samples, Sensor
 
-MAX_RATE_HZ = 100_000.0  # assumed for a device without a declared rate: no program sends records faster
+MAX_RATE_HZ = 100_000.0  # maximum rate of a device without a declared rate: no program sends records faster
 RESET_FACTOR = 3.0  # a gap of more than this multiple of the expected samples is a restart of the device
 RESET_SLACK = 32  # additional samples that a burst may contain
 CLOCK_TOLERANCE = 0.05  # relative error allowed between counter and clock across an outage, in addition to the slack
@@ -168,7 +168,8 @@ LINK = "link"  # frames that the counter shows as missing and of which no byte a
 DEVICE = "device"  # samples that the device itself skipped
 DUPLICATE, LATE, RESET = "duplicate", "late", "counter_reset"
 SILENT = "silent"  # a device without counter sent nothing for too long, and no burst followed
-SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000  # the longer of the two is the limit
+# the limit of a silence is the longer of these: periods of the stream, and ns
+SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000
 
 
 class StreamFault(NamedTuple):

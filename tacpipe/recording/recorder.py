@@ -177,7 +177,7 @@ class Recorder:
             syncing.join()
             spool.finish()
             for name, blocks in last_blocks.items():
-                self._watch(name, blocks)  # the next recording may need them as preroll
+                self._watch(name, blocks)  # the next recording may need these blocks as preroll
 
     def lost(self) -> list[str]:
         """Return a sentence for each stream that is lost, or silent although its link is open.

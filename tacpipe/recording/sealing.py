@@ -214,7 +214,7 @@ def _decode_blocks(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decode
             if block.what in (STALLED, CAUGHT_UP):
                 stall = stalls.add(block)
                 tally.events += [] if stall is None else [stall]
-            elif block.what != OPENED or was_lost:  # opening before the recording is not an event
+            elif block.what != OPENED or was_lost:  # opening a link before the recording is not an event
                 tally.events.append(_note_event(block, sensor))
             continue
         tally.chunks += len(block.size)

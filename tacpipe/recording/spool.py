@@ -81,7 +81,7 @@ def find_next(handle: int, content: mmap.mmap, offset: int) -> int:
             return min(data, len(content))
         stop = min(os.lseek(handle, offset, os.SEEK_HOLE), len(content))
     except OSError as error:
-        if error.errno == errno.ENXIO:  # only a hole follows
+        if error.errno == errno.ENXIO:  # ENXIO: only a hole follows
             return len(content)
         stop = len(content)  # the file system reports no holes
     mark = content.find(MARK, offset + 1, stop)
@@ -106,7 +106,7 @@ def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | St
     return Chunks(stamps.astype(np.int64), sizes, body[12 * count :])
 
 
-ENDED = "ended"  # a note on the whole recording
+ENDED = "ended"  # kind of a note on the whole recording
 TALLY = struct.Struct("<QQq")  # chunks, bytes, last arrival in ns
 RECOVER = "free some space, and `tacpipe acquire --recover` seals it"  # advice if the disk is full
 

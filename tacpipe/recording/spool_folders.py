@@ -92,7 +92,9 @@ def find_abandoned(store: Path) -> list[Path]:
                 age_s = time.time() - (folder / "bytes" if is_locked else folder).stat().st_mtime
                 if is_locked and (folder / "header.json").exists():
                     folders.append((-age_s, folder))
-                elif is_locked and age_s > STARTUP_S:  # its process ended before the recording started or after sealing
+                elif (
+                    is_locked and age_s > STARTUP_S
+                ):  # its process ended before the start of the recording or after sealing
                     remove_spool(folder)
             if not is_locked and age_s > STARTUP_S:
                 folder.rmdir()  # fails for a folder that is not empty
@@ -137,7 +139,7 @@ def remove_spool(folder: Path) -> None:
         folder.rmdir()
 
 
-FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files next to the recordings
+FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # pattern of the names of rig files next to the recordings
 MAX_CLOCK_NS = 1 << 62
 
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 DATAGRAM_SCHEMES = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
 BEGAN, OVER = "began", "over"  # notes for listeners; the blocks between them belong to the recording
-FOREIGN = "foreign"  # packets of other senders
-REFUSED = "refused"  # packets that the sensor does not accept
-DROP_NOTE_S = 1.0  # shortest time between two notes on dropped packets
+FOREIGN = "foreign"  # cause of packets that other senders sent
+REFUSED = "refused"  # cause of packets that the sensor does not accept
+DROP_NOTE_S = 1.0  # minimum time between two notes on dropped packets
 READ_S = 0.1  # timeout of a read, after which the thread checks whether it should stop
 RETRY_S = (0.1, 2.0)  # first and longest pause between two attempts to reopen a lost link
 MUTE_S = 4.0  # a datagram device is reopened after this silence, because nothing else reveals its loss
@@ -37,7 +37,7 @@ TARE_S = 5.0  # timeout for taring a device
 STOP_S = 2.0  # timeout for stopping the thread
 REPLY_S = 0.5  # time after which an unanswered request is repeated
 
-Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
+Tally = Callable[[int, int, int], None]  # arguments: numbers of chunks and bytes, and time of the last arrival in ns
 Listener = Callable[["Chunks | StreamNote"], None]  # receives blocks as they arrive; it must neither block nor raise
 
 

@@ -257,7 +257,7 @@ def recover_spools(store: Store, output: Path | None) -> Iterator[Recorded | Uns
                     continue
                 recorded = recover(store, folder, output)
         except NothingError:
-            continue  # it ended before it received a byte
+            continue  # the process ended before it received a byte
         except TacpipeError as error:
             yield Unsealed(folder, str(error))
         except Exception as error:  # a damaged spool or another version's driver may raise anything

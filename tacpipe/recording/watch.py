@@ -44,7 +44,7 @@ class Watch:
     def __init__(self, stream: RigStream) -> None:
         self.stream = stream
         self.samples = 0
-        self.error = ""  # the last error of its driver
+        self.error = ""  # the last error of the stream's driver
         self.newest: Floats | None = None  # (channel,)
         self.newest_packet: bytes | None = None  # the newest frame of a camera
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to identify the device if they contain no frame
@@ -129,7 +129,7 @@ def tactile_channels(stream: RigStream) -> list[tuple[int, Any]]:
 REFRESH_HZ = 8.0  # refresh rate on a terminal
 LINE_S = 5.0  # period of plain lines without a terminal
 SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange1", "red")
-MAX_COLUMNS = 16  # of the heat map
+MAX_COLUMNS = 16  # maximum number of columns of the heat map
 
 
 class RigView:

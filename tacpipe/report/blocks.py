@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypedDict
 
-TINY = 1e-12  # smaller numbers are rounded zeros
+TINY = 1e-12  # numbers below this are zeros with a rounding error
 NONE = "–"  # shown in place of a missing number
 
 

@@ -61,7 +61,7 @@ def bundle() -> str:
 
     script: str = vl_convert.javascript_bundle(snippet="window.vegaEmbed = vegaEmbed;")
     safe = script.replace("</script", "<\\/script")
-    return f"(() => {{{safe}}})();"  # keeps its own names local
+    return f"(() => {{{safe}}})();"  # the function keeps the names of the script local
 
 
 def _template(name: str) -> str:

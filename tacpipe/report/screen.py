@@ -35,7 +35,7 @@ def sentence(context: Context) -> tuple[str, str]:
         rows = [(comparison, row) for comparison in comparisons if (row := context.row(comparison, method)) is not None]
         if not rows or method is None:
             continue
-        # parts of other splits or timelines are folded
+        # "it" refers to the method of the previous clause
         name = "it" if method.name == last_name else method.name
         last_name = method.name
         verdicts += [row.gain.verdict for _, row in rows]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TAIL = b"\r\n"
-CHANNELS = 4  # per magnetometer
+CHANNELS = 4  # number of channels per magnetometer
 # A Melexis MLX90393 has 16 bits of at least 0.15 µT (datasheet, table of sensitivities). Numbers outside of this range come
 # from bytes that are not a frame.
 MIN_SIZE, MAX_SIZE = 2.0**-20, 2.0**20

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MARKER = b"BT"
-HEADER = 5  # marker, fingers, counter
+HEADER = 5  # size in bytes: marker, fingers, counter
 WORDS = 2 * VIBRATIONS  # words per frame; every second one is PAC
 WORD_HZ = 4400
 MAX_VALUE = 0x0FFF  # 12 bits
-MAX_FINGERS = 5  # per adapter
+MAX_FINGERS = 5  # maximum number of fingers per adapter
 SLOTS = (  # position in the frame of each field of `biotac_fields`: tdc, tac, pdc, pac…, electrodes
     *(2 * VIBRATIONS - 2, 2 * VIBRATIONS - 4, 2 * VIBRATIONS - 6),
     *range(1, WORDS, 2),

@@ -67,7 +67,7 @@ class ByteFramer:
         remaining = len(self._text.data)
         if remaining:
             cause = CUT if self._has_frames else START
-            if self._locked and self._last_size and remaining >= self._last_size:  # a complete frame
+            if self._locked and self._last_size and remaining >= self._last_size:  # a complete frame is buffered
                 cause = UNCONFIRMED
             losses.append(self._lose(0, remaining, cause))
             self._text.cut(remaining)
@@ -197,9 +197,9 @@ class ByteFramer:
         framing, text = self.framing, self._text.data
         good = count
         for at, mark in self._marks(size):
-            column = text[offset + at : offset + good * size : size]  # this byte of each frame
+            column = text[offset + at : offset + good * size : size]  # the byte at this offset of each frame
             good -= len(column.lstrip(mark))
-        if framing.sizes is not None and good > 1:  # the size of the first is already known
+        if framing.sizes is not None and good > 1:  # only the size of the first frame is known to be right
             good = _count_leading(framing.sizes(self._frames(offset, size, good)[:, : framing.header]) == size)
         if framing.check is not None and good:
             good = _count_leading(framing.check(self._frames(offset, size, good)))
@@ -317,7 +317,7 @@ def _count_leading(good: Bools) -> int:
     return len(good) if good[first] else first
 
 
-FEW = 8  # up to this many texts are checked one by one
+FEW = 8  # maximum number of texts that are checked one by one
 Check = Callable[[bytes], bool]
 CheckAll = Callable[[Sequence[bytes]], bool]
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import Bytes, Counts
 
-Step = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.uint32]]  # (value,), (256,) to (value,)
+# maps values (value,) and a table (256,) to new values (value,)
+Step = Callable[[NDArray[np.uint32], NDArray[np.uint32]], NDArray[np.uint32]]
 
 MAX_BLOCK = 1 << 18  # bytes that are looked up at once, which bounds the memory
 
@@ -66,7 +67,8 @@ def crc32(data: Bytes) -> NDArray[np.uint32]:
     return ~_crc(data, _low_bit_first, 0xEDB88320, 32, b"\xff\xff\xff\xff")
 
 
-CrcKind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]  # from polynomial and bits to a table (256,) and a step
+# maps a polynomial and a number of bits to a table (256,) and a step
+CrcKind = Callable[[int, int], tuple[NDArray[np.uint32], Step]]
 
 
 def _crc(data: Bytes, kind: CrcKind, polynomial: int, bits: int, start: bytes) -> NDArray[np.uint32]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 NAME = Path("a cloud")  # name in errors, because the file name is not known here
-CACHED = 4  # clouds that are cached, because the framer and the decoder parse the same clouds
+CACHED = 4  # number of cached clouds, because the framer and the decoder parse the same clouds
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 RATES = (100, 250, 500, 1000)
 COUNTER = 1 << 32
-MAX_SIZE = 8192  # bytes of a frame
+MAX_SIZE = 8192  # maximum size of a frame in bytes
 JUMP_S = 0.25  # a counter that jumps by more than this time is a new session, not a loss
 
 
@@ -178,7 +178,7 @@ class Contactile(Sensor):
         t_us = (samples.t_device_ns // 1000).astype("<u8")[:, None].view(np.uint8)
         _scatter(frames, layout.offsets(pts.HUB), np.hstack([counter, t_us])[:, None])
         forces, *slip = samples.values
-        entries = _bytes(forces, 24)  # all pillars, then the sensors
+        entries = _bytes(forces, 24)  # bytes of all pillars, then those of the sensors
         _scatter(frames, layout.offsets(pts.PILLARS), entries[:, : -self.sensors])
         _scatter(frames, layout.offsets(pts.SENSORS), entries[:, -self.sensors :])
         if self.slip:

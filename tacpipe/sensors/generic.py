@@ -32,7 +32,7 @@ from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples,
 if TYPE_CHECKING:
     import pyarrow as pa
 
-MAX_SIZE = 4096  # bytes of a frame
+MAX_SIZE = 4096  # maximum size of a frame in bytes
 
 
 @dataclass(frozen=True, kw_only=True)

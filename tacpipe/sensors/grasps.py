@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-MAX_GRASPS, MAX_POINTS = 1000, 1_000_000  # per request
+MAX_GRASPS, MAX_POINTS = 1000, 1_000_000  # maximum numbers of grasps, and of points, per request
 MAX_NUMBER = 1 << 62
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{row}_{column}" for row in range(3) for column in range(3))
-CACHED = 4  # requests that are cached, because the framer and the decoder parse the same requests
+CACHED = 4  # number of cached requests, because the framer and the decoder parse the same requests
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class GraspPlace(TypedDict):
 
     g1: list[float]
     g2: list[float]
-    wrist: list[list[float]] | None  # rotation matrix
+    wrist: list[list[float]] | None  # rotation matrix of the wrist, row by row
 
 
 class GraspRequest(TypedDict):

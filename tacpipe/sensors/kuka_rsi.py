@@ -37,8 +37,8 @@ ATTRIBUTES = {"RIst": FRAME, "RSol": FRAME, "AIPos": AXES, "ASPos": AXES, "MACur
 POSES, ANGLES = ("RIst", "RSol"), ("AIPos", "ASPos")
 OUTPUT = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)?")  # an element, or ELEMENT.ATTRIBUTE
 TRUTH = {"true": "1", "false": "0"}
-CACHED = 1024  # messages whose numbers are cached, because the framer and the decoder parse the same messages
-CACHED_BATCHES = 4  # the same for batches of messages
+CACHED = 1024  # number of cached messages, because the framer and the decoder parse the same messages
+CACHED_BATCHES = 4  # number of cached batches of messages
 IPOC = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
 
 

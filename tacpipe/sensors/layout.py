@@ -54,7 +54,7 @@ class Sum:
 
     kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # algorithm
     number: str  # name of the field that contains it
-    begin: int = 0  # first byte of the summed range, from 0; negative values count from the frame's end
+    begin: int = 0  # first byte of the summed range; negative values count from the frame's end
     end: int | None = None  # end of the summed range (exclusive); if absent, the start of the checksum
 
 
@@ -80,7 +80,7 @@ class Length:
     """The field that contains the size of a frame, for boards that send frames of several sizes."""
 
     number: str  # name of the field that contains it
-    plus: int = 0  # bytes of the frame that it does not count
+    plus: int = 0  # number of bytes of the frame that the length does not include
 
 
 @dataclass(frozen=True)

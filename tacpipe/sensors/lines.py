@@ -37,9 +37,9 @@ from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, LocalAddress, 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-MAX_SIZE = 1 << 16  # bytes of a line
+MAX_SIZE = 1 << 16  # maximum size of a line in bytes
 ParsedBatch = tuple[Int64s | None, LineNumbers]  # indices of lines with a sample (None: all), and their numbers
-CACHED = 4  # batches of lines that are cached, because the framer and the decoder parse the same batches
+CACHED = 4  # number of cached batches of lines, because the framer and the decoder parse the same batches
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,10 @@ from tacpipe.sensors.framing import ByteBuffer, Chunks
 from tacpipe.sensors.line_layout import LineSum, line_sums
 from tacpipe.sensors.sensor import Options, OptionValue
 
-MIN_LINES = 5  # needed for a guess
-MAX_LINES = 1000  # examined lines
+MIN_LINES = 5  # minimum number of lines for a guess
+MAX_LINES = 1000  # maximum number of examined lines
 MIN_SHARE = 0.8  # smallest fraction of the lines that must have the same layout
-SEPARATORS = ",;\t|: "  # in the order in which they are tried
+SEPARATORS = ",;\t|: "  # separators in the order in which they are tried
 COMMENTS = ("#", "//", "%", ";")
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")

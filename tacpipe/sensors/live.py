@@ -33,7 +33,7 @@ UNKNOWN, OFF, ON = -1, 0, 1  # states of an alarm
 MAX_PACKET = 60_000  # bytes
 LATENCY = "latency"  # stream that every session records
 LATENCY_NUMBER = 2  # number of this stream in packets
-LSL = "lsl"  # channels of the published LSL stream, which is not values_of
+LSL = "lsl"  # channels of the published LSL stream, which is not recorded
 
 
 class MessageSizes(Protocol):
@@ -61,7 +61,7 @@ class LiveColumn(NamedTuple):
 
     name: str
     unit: str = "1"
-    metadata: Mapping[str, str] = {}  # further metadata of the values_of column
+    metadata: Mapping[str, str] = {}  # further metadata of the recorded column
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Value:
 
     name: str
     meaning: str
-    json: str = ""  # JSON type; empty if the value is only values_of
+    json: str = ""  # JSON type; empty if the value is only recorded
     digits: int | None = None  # decimals of a number in JSON; a number that is not finite becomes null
-    streams: tuple[str, ...] = ()  # streams with columns of this value: values_of streams, and `LSL`
+    streams: tuple[str, ...] = ()  # streams with columns of this value: recorded streams, and `LSL`
     type: str = "<f4"  # numpy type of each column
     unit: str = ""
-    quantity: str = ""  # metadata of the values_of columns
+    quantity: str = ""  # metadata of the recorded columns
     columns: Callable[[MessageSizes], list[LiveColumn]] | None = None  # None: one column with the name of the value
     schema: Callable[[MessageSizes], dict[str, Any]] | None = None  # JSON schema; None: the schema of its type
     attribute: str = ""  # attribute of the message that contains it; empty: the name of the value

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 LENGTHS = {3: 0x0A, 6: 0x10, 12: 0x1C}  # last byte of the header by number of axes
-SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # command byte by rate in Hz
+SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # rate in Hz -> byte of the command
 FILTERS = {0.0: 0, 500.0: 1, 150.0: 2, 50.0: 3, 15.0: 4, 5.0: 5, 1.5: 6}  # command byte by cut-off in Hz; 0: no filter
 CONFIGURE = b"\xaa\x00\x32\x03"
 STOP, TARE = 0, 0xFF

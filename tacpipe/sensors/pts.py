@@ -35,7 +35,7 @@ HUB, PILLARS, SENSORS, PILLAR_SLIP, SENSOR_SLIP = 1, 3, 4, 5, 6
 KINDS = {PILLARS: 2, SENSORS: 2, PILLAR_SLIP: 1, SENSOR_SLIP: 1}  # first number of each entry
 SIZES = {HUB: 12, PILLARS: 24, SENSORS: 24, PILLAR_SLIP: 5, SENSOR_SLIP: 9}  # bytes of the values of an entry
 NESTED = (PILLARS, PILLAR_SLIP)  # blocks with a table of pillars for each sensor
-WIDTH = 2  # bytes of the offsets that `template` writes
+WIDTH = 2  # number of bytes of the offsets that `template` writes
 CACHED = 8  # cached layouts per frame size
 
 
@@ -304,7 +304,7 @@ class FreshFramer:
         half = self._modulus // 2
         steps = (np.diff(counters[t_ns - t_ns[0] < SETTLE_NS]) + half) % self._modulus - half
         jumps = np.flatnonzero((steps < 0) | (steps > self._max_step))
-        remaining = int(jumps[-1]) + 1 if len(jumps) else 0  # stale frames
+        remaining = int(jumps[-1]) + 1 if len(jumps) else 0  # number of stale frames
         stale, fresh = [], []
         for run in runs:
             count = min(remaining, len(run.t_ns))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 START, HEADER = 0x9A, 4
 READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
 DATA = (READ, SYNCHRONOUS, ASYNCHRONOUS)  # commands of packets with data
-ROWS, COLUMNS = 7, 4  # taxels of a fingertip
+ROWS, COLUMNS = 7, 4  # number of rows and columns of taxels of a fingertip
 KINDS = {  # fields: the upper half of the first byte, type and number of the values
     "static": (0x10, ">u2", ROWS * COLUMNS),
     "dynamic": (0x20, ">i2", 1),
@@ -56,7 +56,8 @@ class Structure(NamedTuple):
     layout: Layout | None  # None if the packet does not consist of known fields
 
 
-_latest: dict[int, Structure] = {}  # last structure by size; the next frame usually has the same
+# structure of the last frame by size, because the next frame usually has the same structure
+_latest: dict[int, Structure] = {}
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TRANSLATION, ROTATION, BUTTONS, BATTERY = 1, 2, 3, 23
-# bytes, including the number
+# size of a report in bytes, including its number
 SIZES = {TRANSLATION: (13, 7), ROTATION: (7,), BUTTONS: tuple(range(2, 8)), BATTERY: (2, 3)}
-PARTS = {TRANSLATION: slice(0, 6), ROTATION: slice(6, 12), BUTTONS: slice(12, 16)}  # bytes of the state
-FRAME = 17  # bytes: number of the report, 6 axes, 32 buttons
+PARTS = {TRANSLATION: slice(0, 6), ROTATION: slice(6, 12), BUTTONS: slice(12, 16)}  # bytes of each part in the state
+FRAME = 17  # size of a state in bytes: number of the report, 6 axes, 32 buttons
 MAX_REPORT = 13  # bytes
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key or a path such as pose.x or q.0, with its unit
 RESERVED = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
-MAX_INTEGER = 1 << 62  # limit of counters and times
+MAX_INTEGER = 1 << 62  # maximum value of counters and times
 
 
 @dataclass(frozen=True)

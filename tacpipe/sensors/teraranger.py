@@ -27,7 +27,7 @@ MARKER = b"\x54"
 SIZE = 4
 BINARY = bytes.fromhex("00 11 02 4C")  # selects binary frames instead of text
 START, STOP = bytes.fromhex("00 52 02 01 DF"), bytes.fromhex("00 52 02 00 D8")
-MAX_HZ = 240.0  # of the Evo 60m
+MAX_HZ = 240.0  # maximum rate of an Evo 60m
 
 
 @dataclass(frozen=True)

@@ -125,8 +125,8 @@ PROTOCOL = 2
 VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvMUOISP"
 KINDS = (VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE)
 STAMP = "timestamp"  # seconds since the controller started
-EMULATED_VERSION = (5, 11, 0, 0)  # major, minor, bugfix, build
-MAX_VALUE = 1e12  # larger than any output: metres, newtons, radians, seconds since start
+EMULATED_VERSION = (5, 11, 0, 0)  # version: major, minor, bugfix, build
+MAX_VALUE = 1e12  # upper bound of all outputs: metres, newtons, radians, seconds since the start
 MAX_PACKAGE = 4096  # bytes
 
 

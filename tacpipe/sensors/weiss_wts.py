@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MARKER = b"\xaa\xaa\xaa"
-HEADER = 6  # marker, number, size
+HEADER = 6  # size in bytes: marker, number, size
 FRAME, START, STOP, TARE, MATRIX = 0x00, 0x21, 0x22, 0x23, 0x30
 TICK_NS = 10_000  # tick of the sensor's clock
 CELLS_AT = HEADER + 5  # offset of the cells, after time and flags
 RUN_LENGTH = 0x01  # flag
-MAX_RUN, VALUE_MASK = 15, 0x0FFF  # 4 and 12 bits
+MAX_RUN, VALUE_MASK = 15, 0x0FFF  # largest run (4 bits), and mask of the value (12 bits)
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 COUNT = "[0-9a-fA-F]{1,4}"
 DIGITS = 4  # hexadecimal digits of a count with leading zeros
-WELCOME = b'{"message": "Welcome"}'  # the shortest first message of a server
-MAX_TIME_S = 4e9  # the year 2096; later times are invalid
+WELCOME = b'{"message": "Welcome"}'  # shortest first message that a server sends
+MAX_TIME_S = 4e9  # maximum valid time (the year 2096)
 
 
 @dataclass(frozen=True)

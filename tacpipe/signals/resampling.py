@@ -16,7 +16,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.signals.kinematics import make_continuous
 
 GAP_NS = 50_000_000  # longest time between two samples without a gap, for sensors of 20 Hz or more
-GAP_PERIODS = 2.5  # the same for slower sensors, in periods
+GAP_PERIODS = 2.5  # the same limit for slower sensors, in periods
 STEPS_AT_ONCE = 1 << 20  # number of steps between samples that are in memory at once
 HALF_BITS = 22  # bits of half a step in ns
 PARALLEL = 1e-6  # rad; below this angle, slerp divides by almost zero, and linear weights are exact to 1e-13

@@ -23,7 +23,7 @@ class Protocol:
     """The protocol that each slide of an experiment should follow."""
 
     speed_m_s: float
-    speed_tolerance: float  # fraction of it
+    speed_tolerance: float  # tolerance as a fraction of the speed
     min_s: float
     pressure_low: float  # counts
     pressure_high: float

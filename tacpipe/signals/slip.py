@@ -43,7 +43,7 @@ class SlipLimits:
     off_sigma: float = 2.0
     on_rows: int = 3
     off_rows: int = 5
-    noise_floor: float = 3.0  # counts per second
+    noise_floor: float = 3.0  # minimum noise in counts per second
     level_count: float = 0.75  # counts
 
     def __post_init__(self) -> None:
@@ -211,11 +211,11 @@ class HoldingPhases:
 class TouchLimits:
     """Criteria for contact and motion, in the unit of the channels."""
 
-    end_rows: int  # last rows, whose median shows the untouched sensor
-    contact_level: float  # root mean square over channels
-    contact_fraction: float  # of the 90th percentile of the level
-    contact_s: float  # shortest contact before a loss
-    motion_level: float  # root mean square change between two rows
+    end_rows: int  # number of last rows, whose median shows the untouched sensor
+    contact_level: float  # root mean square difference over channels above which there is contact
+    contact_fraction: float  # the same threshold as a fraction of the 90th percentile of the level
+    contact_s: float  # minimum duration of the contact before a loss
+    motion_level: float  # root mean square change between two rows above which the object moves
     quiet_s: float  # time without motion, or without contact, that separates two motions or contacts
 
 

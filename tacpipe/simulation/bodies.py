@@ -238,7 +238,7 @@ def _first_root(square: Floats, linear: Floats, constant: Floats) -> Floats:
     return np.asarray(roots.min(axis=0))
 
 
-CLOSE_M = 1e-8  # distance at which a ray counts as having reached the surface
+CLOSE_M = 1e-8  # distance at which a ray counts as having hit the surface
 MAX_STEPS = 200  # after this many steps, a grazing ray counts as a miss
 
 

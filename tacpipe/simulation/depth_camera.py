@@ -19,10 +19,10 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.simulation.bodies import Rest, Shape
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 615.0  # pixels
-DEPTH_NOISE_M = 0.0015  # standard deviation at 1 m
-COLOUR_NOISE = 6.0  # standard deviation, of 255
+DEPTH_NOISE_M = 0.0015  # standard deviation of the depth at a distance of 1 m
+COLOUR_NOISE = 6.0  # standard deviation of a colour value from 0 to 255
 RIPPLES = 3  # number of waves in a texture
-WAVE_M = (0.01, 0.08)  # range of their wavelengths
+WAVE_M = (0.01, 0.08)  # range of the wavelengths of ripples
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _place_neighbour(placed: Placed, neighbour: Shape, up: Floats, camera_m: flo
         x, y = centre + (placed.shape.bound_m + neighbour.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
         best = place_shape(neighbour, pose, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
         rows, columns = window(best)
-        visible = len(rows) and len(columns)  # it may be outside of the image
+        visible = len(rows) and len(columns)  # the body may be outside of the image
         if visible and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < HEIGHT:
             break
     assert best is not None

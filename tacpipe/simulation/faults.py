@@ -21,7 +21,7 @@ class DeviceClock:
 class LoggedSamples:
     """The true times and the sequence numbers of the samples in a log. Both have shape (time,)."""
 
-    true_ns: Times  # since the start of the trial
+    true_ns: Times  # time in ns since the start of the trial
     seq: Times  # counts all samples, so that a lost one leaves a gap
 
     @property

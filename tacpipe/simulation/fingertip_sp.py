@@ -17,18 +17,18 @@ from tacpipe.channels import biotac_sp
 
 CHANNELS = biotac_sp.ELECTRODES + 1  # tactile channels of a finger: the electrodes, then the fluid pressure
 GAIN_COUNT = 2600.0  # decrease of an electrode if all fluid is squeezed out
-FLUID_M = 0.0006  # indentation at which 1 - 1/e of this is reached
+FLUID_M = 0.0006  # indentation at which 1 - 1/e of this decrease is reached
 BREADTH = 1.1  # ratio of the pressed region's sigma to the contact radius
 BULGE = 0.35  # fraction of the decrease of pressed electrodes by which the others increase
 REST_COUNT = (2400.0, 3480.0)  # range of the rest level of an electrode
 NOISE_COUNT = (3.5, 6.4)  # range of the standard deviation of an electrode
 PRESSURE_NOISE_COUNT = (0.05, 0.25)
-PRESSURE_COUNT = (1676.0, 2779.0)  # untouched, by finger
+PRESSURE_COUNT = (1676.0, 2779.0)  # reading of the untouched finger, by finger
 PRESSURE_COUNT_N = 140.0  # slope
 FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # bounds of the readings
 DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods of the drift
 DAY_NS = 86_400_000_000_000
-# values by finger
+# ranges of the other channels of the untouched finger, by finger
 OTHERS_COUNT = {"pac0": (2037, 2049), "pac1": (2037, 2049), "tac": (2152, 2051), "tdc": (2620, 2449)}
 OTHERS_NOISE_COUNT = {"pac0": 8.0, "pac1": 8.0, "tac": 10.0, "tdc": 6.0}
 VIBRATION_COUNT_S_N = 3.0  # PAC per rate of change of the force

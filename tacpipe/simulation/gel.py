@@ -43,7 +43,7 @@ LIGHTS = np.array([[1.0, 0.0], [-0.5, 0.87], [-0.5, -0.87]], np.float32)
 DENT_N, SHADE = 1 / 8.0, 900.0  # dent in image units per newton, and grey levels per unit of slope
 NOISE = 1.5  # standard deviation of a pixel, grey levels
 NOISE_IMAGES, NOISE_STEP = 4, 256_889  # number of images for which noise is drawn; offset of their parts, a prime
-CAMERA_STREAM = 2  # seeds of the cameras, next to those of the rig's devices
+CAMERA_STREAM = 2  # part of the random seed of the cameras; the rig's devices have other numbers
 
 
 def rest_places_px() -> Floats:
@@ -67,7 +67,7 @@ class GelStates:
 def gel_states(scene: PickScene, finger: int, true_ns: Times) -> GelStates:
     """Return the gel of finger 0 or 1 at ``true_ns`` (time,). The image's x is the hand's x, its y points down."""
     rest_px = rest_places_px()
-    places_m = (rest_px - CENTRE_PX) * [1, -1] / PX_M  # along the hand's x and z
+    places_m = (rest_px - CENTRE_PX) * [1, -1] / PX_M  # positions of the markers along the hand's x and z
     force_n = pick_and_move.touch(scene, finger, true_ns, places_m=places_m)  # (time, marker, axis)
     distance2 = ((rest_px[:, None] - rest_px) ** 2).sum(axis=2)
     coupling = np.exp(-distance2 / (2 * NEIGHBOUR_PX**2))

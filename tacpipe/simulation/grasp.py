@@ -135,7 +135,7 @@ START_NS = 1_620_000_000_000_000_000  # UTC time of the first grasp
 GRASP_NS = 180_000_000_000  # time between grasps of a session
 SESSION = 20  # grasps
 READ_NS = 5_000_000_000  # time between the plan and the reading
-NOISE, BOUND = 4, 5  # streams of random numbers
+NOISE, BOUND = 4, 5  # parts of the random seeds of noise and of the error bound
 
 
 def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:

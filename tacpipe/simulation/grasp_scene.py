@@ -27,7 +27,7 @@ SHARES = (0.6, 0.2, 0.2)  # fractions of the objects by entry of MODULI_PA
 # range of the slope of cones, within friction, and smallest ratio of the radii of top and bottom
 TAPER, NARROW = (0.08, 0.22), 0.4
 REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
-SPHERES_M = (0.012, 0.058)  # range of their radii
+SPHERES_M = (0.012, 0.058)  # range of the radii of spheres
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def _draw_shape(family: str, rng: np.random.Generator) -> Shape:
 OPENING_M = (0.02, 0.12)  # range of the distance between the fingers
 CONE_RAD = np.deg2rad(15.0)  # maximum angle between the closing direction and a normal
 MARGIN_M = 0.004  # smallest distance of a contact from an edge
-DIRECTIONS = 36  # number of candidate lines
-LEAN_RAD = np.deg2rad(4.0)  # standard deviation of their angle to the table
+DIRECTIONS = 36  # number of candidate closing lines
+LEAN_RAD = np.deg2rad(4.0)  # standard deviation of the angle between a closing line and the table
 PITCH_RAD = np.deg2rad(20.0)  # maximum angle between approach and vertical, around the closing axis
 FAR_M = 0.2  # distance from which the fingers approach
 
@@ -167,9 +167,9 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
 CAMERA_M = (0.9, 1.2)  # height above the table
 TILT_RAD = np.deg2rad(8.0)  # maximum tilt of the camera
 SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # mean and standard deviation of object positions in the camera's view
-MIN_POINTS = 800  # of a cloud, as in the published set
-MAX_POSES = 100  # tried poses of an object
-SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
+MIN_POINTS = 800  # minimum number of points of a cloud, as in the published set
+MAX_POSES = 100  # maximum number of poses of an object that are tried
+SENSORS, THINGS, TRIAL = 1, 2, 3  # parts of the random seeds of sensors, objects and trials
 
 
 @dataclass(frozen=True)

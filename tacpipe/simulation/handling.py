@@ -39,10 +39,10 @@ from tacpipe.simulation.trajectory import (
 
 PLANNED, MIXED = "planned", "mixed"  # no handling; equal chances of all kinds
 HANDLINGS = ("jolt", "jolt-held", "fade", "fade-held", "release", "shake", "hold")
-FRICTIONS = (0.35, 0.43, 0.51, 0.60)  # mu_s of the surfaces
+FRICTIONS = (0.35, 0.43, 0.51, 0.60)  # friction coefficients mu_s of the surfaces
 SLIPPING, HELD = (1.05, 1.25), (0.85, 0.97)  # ranges of the largest load as a fraction of the friction limit
-FIRM = (0.45, 0.75)  # the same for a firm grasp
-SHAKEN = (0.60, 0.90)  # the same for an object that is shaken
+FIRM = (0.45, 0.75)  # range of the largest load for a firm grasp
+SHAKEN = (0.60, 0.90)  # range of the largest load for an object that is shaken
 LIFT_M, LIFT_S = (0.10, 0.25), (0.6, 1.0)  # ranges of height and duration of the lift
 FADE_S = (0.4, 1.5)  # range of the duration of a decrease of the grip
 RELEASE_S = (0.05, 0.30)  # range of the duration of the opening

@@ -123,10 +123,10 @@ def _slide(grasp: HeldObject, acceleration_m_s2: Floats, rise_m: Floats | None, 
     limits, heights_m = grasp.limit_n, np.ones(rows) if rise_m is None else rise_m
     sx = sz = vx = vz = 0.0  # displacement (x, z) by slip, and relative velocity (x, z)
     load_fraction = min(max(float(heights_m[first]) / TABLE_M, 0.0), 1.0)
-    ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
+    ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection (x, z) of the spring
     ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * load_fraction / STIFFNESS_N_M
     slipping = False
-    pending: list[tuple[float, ...]] = []  # rows that are not in `moves` yet
+    pending: list[tuple[float, ...]] = []  # rows that have not been written to `moves`
     last = first  # number of rows in `moves`
     for height_m, pull_x, pull_z, limit in _python_rows(mass, acceleration_m_s2, limits, heights_m, first):
         load_fraction = min(max((height_m + sz) / TABLE_M, 0.0), 1.0)

@@ -39,7 +39,7 @@ PROXIMITY_RATE_HZ = 400.0
 REST_COUNT = 740.0
 COUNT_MM = 8.0  # decrease of the reading per millimetre of downward slip
 NOISE_COUNT = 0.8
-FLOOR_COUNT = 544.0  # reached at 24.5 mm
+FLOOR_COUNT = 544.0  # minimum reading, which is reached at 24.5 mm
 
 
 def proximity_readings(up_m: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.int16]:
@@ -51,11 +51,11 @@ def proximity_readings(up_m: Floats, noise_scale: float, rng: np.random.Generato
 
 START_NS = 1_600_000_000_000_000_000  # UTC time of the first trial; the next ones start minutes later
 TRIAL_NS = 120_000_000_000
-MASSES_KG = (0.20, 0.28, 0.36, 0.44, 0.52)  # five fills of a bottle
+MASSES_KG = (0.20, 0.28, 0.36, 0.44, 0.52)  # mass of a bottle at five fill levels
 GRIP_N = (4.0, 8.0)  # normal force of each finger
 FRICTION = (0.35, 0.60)  # mu_s
 RESERVE = 1.3  # minimum 2 mu_s N / (m g): slip starts at 0.3 g or more, and kinetic friction still carries the weight
-OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
+OPEN_M, GRASPED_M = 0.070, 0.040  # distance between the fingers, open and around the bottle
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
 HANDLING_STREAM = 3  # part of the random seed of a handling; devices and cameras have other numbers
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
@@ -73,7 +73,7 @@ class PickRig:
     """
 
     duration_s: float = 12.0
-    protocol: str = "mixed"  # name of trajectory.PROTOCOLS, or mixed for equal chances
+    protocol: str = "mixed"  # a name in `trajectory.PROTOCOLS`, or mixed for a random one
     effort: float = 0.0  # ratio of the largest planned load to the friction limit; 0: random grip and friction
     friction_scale: float = 1.0
     grip_loss_probability: float = 0.0
@@ -235,7 +235,8 @@ def touch(
         for j, skin in enumerate(scene.skins)
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
-    shear = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))  # of both fingers
+    # shear forces of both fingers' taxels
+    shear = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
     lagging_n = at(taxels.lag(contact.normal_n[:, finger], trajectory.RATE_HZ))
     fraction = taxels.fractions(scene.skins[finger], displacement, torque, places_m)
     normal = (1 - creep) * pressures[finger] + creep * lagging_n[:, None] * fraction

@@ -73,7 +73,7 @@ class Situation:
     curvatures_1_m: Floats  # (finger, 2), principal curvatures of the object at the contact
     bending_1_m: Floats  # (finger, axis), normal curvatures of the object along the axes of the pad
     lean_rad: Floats  # (finger, axis), tilt of the contact normal from the pad's normal
-    compliance_1_pa: float  # of the object
+    compliance_1_pa: float  # compliance of the object in 1/Pa
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Touch:
     force_n: Floats  # (draw, finger)
     contact_m: Floats  # (draw, finger)
     skin_m: Floats  # (draw, finger)
-    centre_m: Floats  # (draw, finger, axis), on the unrolled core
+    centre_m: Floats  # (draw, finger, axis), position of the contact on the unrolled core
 
 
 def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation:

@@ -51,7 +51,7 @@ ARM_GAP = 0.12  # fraction of the arm's readings that are followed by a gap
 ARM_GAP_S = 0.04
 SPEED_NOISE_M_S, SPIKE_M_S, SPIKES = 0.0006, 0.02, 0.01
 FORCE_NOISE_N, TORQUE_NOISE_NM = 0.15, 0.02
-MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
+MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # parts of the random seeds
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ class SlideScene:
     trial: SlideTrial
     material: texture.Material
     surface: texture.Waves
-    true_ns: Times  # since the start of the trial
-    position_m: Floats  # along the slide
+    true_ns: Times  # time in ns since the start of the trial
+    position_m: Floats  # position along the slide
     speed_m_s: Floats
     force_n: Floats
     contact: Floats  # 0: no contact, 1: full contact

@@ -25,7 +25,7 @@ PITCH_M = places.USKIN_PITCH_M  # pitch of the taxels
 PAD_M = 2 * PITCH_M  # half the width of a pad, the limit of the centre of pressure
 PLACES_M = places.uskin_m()  # (taxel, axis)
 SIGMA_M = (0.004, 0.006)  # standard deviation of the Gaussian that distributes the pressure
-CENTRE_M = 0.003  # maximum distance of its centre from the pad's centre along each axis
+CENTRE_M = 0.003  # maximum distance between the centres of the pressure and of the pad, along each axis
 TWIST_M_NM = 0.02  # shift of the centre of pressure per torque
 # x, y, z; chosen with `BULGE` for the standard deviations of the published recordings
 GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)

@@ -29,7 +29,7 @@ FRICTION = (0.3, 0.9)
 STIFFNESS_N_M = (1000.0, 4000.0)
 WEAR = 0.2  # standard deviation of a grating's log amplitude between trials
 STRETCH = 0.01  # standard deviation of the relative stretch of a grating
-WAVES = 64  # waves of a background
+WAVES = 64  # number of waves of a background
 GRID_M = 0.00005  # grid of computed points, with linear interpolation between them
 
 
@@ -39,7 +39,7 @@ class Material:
 
     wavelength_m: Floats  # (grating,)
     amplitude_n: Floats  # (grating,)
-    background_n: float  # standard deviation
+    background_n: float  # standard deviation of the background in N
     exponent: float
     friction: float  # mu
     stiffness_n_m: float  # combined stiffness of finger and material
@@ -49,7 +49,7 @@ class Material:
 class Waves:
     """A sum of sines. Arrays have shape (wave,)."""
 
-    number_per_m: Floats  # one over the wavelength
+    number_per_m: Floats  # waves per metre: one over the wavelength
     amplitude_n: Floats
     phase_rad: Floats
 

@@ -83,7 +83,8 @@ def parse_address(text: str) -> BucketAddress | Path:
             "file://, or a path of the file system."
         )
     path = location.rstrip("/")
-    if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown, because it may contain a password
+    # the path is not quoted in the error, because it may contain a password
+    if not _PARTS.fullmatch(path) or ".." in path.split("/"):
         raise UsageError(
             f"An address of a store is {scheme}://BUCKET/FOLDER with letters, digits and ._=+,- only. Credentials belong in "
             f"the environment or in a profile, never in an address."
@@ -135,7 +136,7 @@ def _add_profile(client_settings: ClientSettings, profile_name: str, environment
         reader = configparser.RawConfigParser()
         try:
             reader.read(path, encoding="utf-8")
-        except (configparser.Error, UnicodeDecodeError):  # the error's text could contain a credential
+        except (configparser.Error, UnicodeDecodeError):  # not quoted, because the text could contain a credential
             raise UsageError(f"{path} is not a file of profiles: a line of it cannot be read.") from None
         for section in (name, f"{section_prefix}{name}"):
             if reader.has_section(section):

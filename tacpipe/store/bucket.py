@@ -32,7 +32,8 @@ _LARGE = 4  # multi-part objects transferred concurrently, which limits memory t
 _COPY_BYTES = 5 * 10**9  # largest object that S3 copies in one request
 _STATUS = re.compile(r"status code: (\d{3}[ A-Za-z]*)")
 _NO_BUCKET = ("NoSuchBucket", "bucket does not exist", "ContainerNotFound")
-_METADATA = ("169.254.169.254", "metadata.google.internal")  # used last, if nothing else provides credentials
+# hosts that are used last, if nothing else provides credentials
+_METADATA = ("169.254.169.254", "metadata.google.internal")
 
 
 class Bucket:
@@ -225,7 +226,8 @@ class Bucket:
                 return request()
             except obstore.exceptions.GenericError as error:
                 if remaining_tries == 0 or not _may_pass(error):
-                    raise self._describe_error(error) from None  # the client's error may contain confidential text
+                    # the client's error is suppressed, because it may contain confidential text
+                    raise self._describe_error(error) from None
             except FileNotFoundError as error:
                 if any(mark in str(error) for mark in _NO_BUCKET):
                     raise self._describe_error(error) from None
@@ -316,7 +318,7 @@ def _connect(address: BucketAddress) -> Any:
         arguments["credential_provider"] = client_settings.provider
     try:
         return from_url(client_settings.url or str(address), **arguments)
-    except (BaseError, ValueError, TypeError):  # the error's text may contain a credential
+    except (BaseError, ValueError, TypeError):  # the error is suppressed, because it may contain a credential
         raise UsageError(
             f"The settings for {address} cannot be used. Look at the variables {_VARIABLES[address.scheme]} and the profile."
         ) from None

@@ -26,8 +26,8 @@ from tacpipe.io.files import readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
-LOCK_TIMEOUT_S = 3600.0  # default; TACPIPE_LOCK_TIMEOUT_S overrides it
-REPORT_AFTER_S = 2.0  # shorter waits are not reported
+LOCK_TIMEOUT_S = 3600.0  # default timeout; TACPIPE_LOCK_TIMEOUT_S overrides it
+REPORT_AFTER_S = 2.0  # wait in seconds above which it is reported
 LEASE_BYTES = 1 << 30  # maximum size of a lease, which is enough for 16 million objects
 _POLL_S = 0.02
 _UNKNOWN_S = 14 * 86400.0  # how long a run of another host counts as active on a file system without locks
@@ -213,7 +213,7 @@ def parse_lease(path: Path, content: bytes) -> Run:
     try:
         value = json.loads(first)
     except ValueError:
-        value = None  # the lease is being written
+        value = None  # the lease is still being written
     holder = cast("Holder", value if isinstance(value, dict) else {})
     return Run(path, holder, set(digests.split()))
 

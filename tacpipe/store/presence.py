@@ -144,10 +144,10 @@ def _file(store: Store, directory: Path) -> Path:
     return store.root / layout.PRESENCE / name_of(*store.roots.kind_and_name(directory))
 
 
-BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system may be repaired between two boots
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # id of the boot; a file system may be repaired between two boots
 _MAX_CHANGED = 32  # shelves that each command checks again before the note is rewritten
 _SAMPLE = 16  # number of files for which two ways of reading the inode are compared
-_MANIFEST = "manifest.json"  # a copy and not a link, so its content is hashed whenever a note is used
+_MANIFEST = "manifest.json"  # file that is a copy and not a link, so its content is hashed whenever a note is used
 
 
 class Look:

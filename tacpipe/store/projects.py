@@ -111,7 +111,7 @@ def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
             raise
         derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:32]
         return Project(derived, _name(folder))
-    written = identity_of(store, folder)  # the first process that writes it wins
+    written = identity_of(store, folder)  # the identity that the first process wrote is valid
     assert written is not None
     return written
 

@@ -37,7 +37,7 @@ from tacpipe.store.remote_roots import RemoteRoots
 from tacpipe.store.store import AbsentError, MissingError, Object, read_limit
 
 SNAPSHOTS = "snapshots"  # keys of the records of each manifest, so that a pull reads only these
-_LISTED = 12  # number of requests that cost as much on S3 as listing 1,000 names
+_LISTED = 12  # number of single requests that cost as much on S3 as listing 1,000 names
 _PAGE = 1000  # names listed per request
 _TRIES = 10  # attempts to replace a record that others also replace
 
@@ -251,7 +251,7 @@ class RemoteStore:
             with contextlib.suppress(FileNotFoundError):
                 yield from self.files.blocks(entry.name, limit)
                 return
-        try:  # it may have been put back in the meantime
+        try:  # another process may have moved the object back in the meantime
             yield from self.files.blocks(layout.object_name(name), limit)
         except FileNotFoundError:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None

@@ -203,7 +203,7 @@ class Store:
             is_stored = self._exists(name, len(content))
         if not is_stored:
             self.write_file(path, content, mode=0o444)
-        if durable:  # also if another process stored it
+        if durable:  # the folder is synced even if another process stored the object
             self.sync(path)
         return Object(name, len(content))
 
@@ -407,7 +407,7 @@ class Store:
         key = digest(identity)
         record, content = record_content(identity, result, provenance)
         path = self.record_path(key)
-        for _ in range(2):  # try twice, in case the existing record is damaged
+        for _ in range(2):  # twice, because the existing record may be damaged
             if self.write_file(path, content, exclusive=not replace):
                 break
             existing = self.record(key)

@@ -25,7 +25,7 @@ DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a 
 # column of the recorder with the maximum delay of each arrival time; not a channel
 UNCERTAIN = "t_uncertain_ns"
 NOT_INTERPOLATED = ("label", "time", "mask")  # quantities whose nearest sample is used
-POINTS = 1 << 18  # number of times that are compared at once
+POINTS = 1 << 18  # number of timestamps that are compared at once
 
 
 def channel_names(schema: pa.Schema) -> list[str]:
@@ -124,7 +124,7 @@ class TimedStream:
     arrival_ns: Times  # (time,): arrival times on the host's clock
     attributes: dict[str, Attribute] = field(default_factory=dict)  # results of the clock fit
     wraps: Mapping[str, Wraps] = field(default_factory=dict)  # channels whose counts are unwrapped
-    first_row: int = 0  # number of samples before these
+    first_row: int = 0  # number of samples of the stream before these samples
 
     @property
     def channels(self) -> list[str]:

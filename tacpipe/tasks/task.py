@@ -57,7 +57,7 @@ class PredictionRequest:
     """Options of a prediction."""
 
     steps: Sequence[int]  # steps ahead, ascending, for tasks that predict the future
-    quantiles: Sequence[int] = ()  # in percent, ascending
+    quantiles: Sequence[int] = ()  # quantile levels in percent, ascending
     probabilities: bool = False  # True to add calibrated probabilities
     allow_look_ahead: bool = False  # for causal predictions: accept a model that was trained on rows with look-ahead
 
@@ -151,7 +151,7 @@ class Task(ABC):
 class CalibrationRequest:
     """Options of the calibration of a trained model."""
 
-    quantiles: tuple[int, ...]  # in percent, ascending
+    quantiles: tuple[int, ...]  # quantile levels in percent, ascending
     promise: bool  # True if bands must have at least their nominal coverage in a new recording
     false_unknown: float  # allowed fraction of slides of learned classes that are classified as unknown
     seed: int

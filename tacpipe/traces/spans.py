@@ -17,7 +17,7 @@ from tacpipe.traces.curves import TIME
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_VALUE_NAMES = {"phase": {-1: "", 0: "slide", 1: ""}}  # values of label columns with names of their own
+_VALUE_NAMES = {"phase": {-1: "", 0: "slide", 1: ""}}  # names of the values of label columns
 _UNSET = ("", "0", "-1", "False", "None", "nan")  # values of a label that are not drawn
 CONTACT, PADDING = "contact", "padding"  # lane of the contacts, and text of padding
 _SWITCHES = ({"0", "1"}, {"1"}, {"0"}, {"False", "True"}, {"True"}, {"False"})

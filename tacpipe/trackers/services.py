@@ -31,7 +31,7 @@ MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow rejects its file store
 MLFLOW_EXPERIMENT = "tacpipe"
 MLFLOW_TAG = "tacpipe.run"
 MAX_PARAM_LENGTH = 500  # maximum length of a param that every release of MLflow stores
-_DEFAULTS = {  # used if the user has not set these
+_DEFAULTS = {  # values of environment variables that the user has not set
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # the default is 7 attempts with growing waits, which would delay training

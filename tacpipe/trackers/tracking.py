@@ -136,7 +136,7 @@ class Tracking:
     """Several trackers that follow trainings as one; an exception of a tracker only ends that tracker."""
 
     trackers: dict[str, Tracker]  # trackers by their option ``--track``
-    name: str  # params of the run
+    name: str  # name of the run
     params: Mapping[str, Scalar]
     failures: list[str] = field(default_factory=list)
     _started: bool = False

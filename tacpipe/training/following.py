@@ -60,10 +60,11 @@ class Line(Validated, NetworkLabels):
 class TrainedNetwork:
     """One of the networks that a stage trains."""
 
-    epochs: int  # maximum number
+    epochs: int  # maximum number of epochs
     number: int = 1
     count: int = 1
-    labels: NetworkLabels = field(default_factory=NetworkLabels)  # added to each of its lines
+    # labels that are added to each line of the network's history
+    labels: NetworkLabels = field(default_factory=NetworkLabels)
 
     @property
     def name(self) -> str:

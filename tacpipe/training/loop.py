@@ -34,7 +34,7 @@ from tacpipe.training.following import Followers, NetworkLabels, TrainedNetwork,
 from tacpipe.training.following import Line as Line
 from tacpipe.training.schedule import Schedule as Schedule
 
-BETAS, EPSILON = (0.9, 0.999), 1e-8  # as in the paper, and torch's defaults
+BETAS, EPSILON = (0.9, 0.999), 1e-8  # Adam's constants, as in the paper and torch's defaults
 
 
 class Adam:
@@ -117,7 +117,7 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Seque
     with readable_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         draft = folder / f"{FILE}.draft"
-        draft.unlink(missing_ok=True)  # left by a killed run
+        draft.unlink(missing_ok=True)  # a killed run may have left a draft
         write_whole(str(folder / FILE), signed, str(draft))
         sync_folder(str(folder))
 
@@ -302,7 +302,7 @@ def _train_epochs(
     """Train all remaining epochs and report each to the followers."""
     random = torch.get_rng_state()
     with following.follow_network(network, list(run.history)) as followers:
-        torch.set_rng_state(random)  # undo what followers drew
+        torch.set_rng_state(random)  # restores the state before the followers drew random numbers
         while not run.is_finished(schedule):
             epochs_trained = len(run.history)
             with following.announce_resume(network, epochs_trained):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 NEEDED_BY = "Reading video"  # start of the error about a missing extra
 MAX_DELAY = 16  # maximum number of frames that a decoder delays
 DECODERS = {"av1": "libdav1d"}  # FFmpeg's own AV1 decoder needs a graphics card
-GREY = "gray"  # FFmpeg's name
+GREY = "gray"  # FFmpeg's name of the grey pixel format
 
 
 def decode_frames(

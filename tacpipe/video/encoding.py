@@ -13,7 +13,7 @@ from tacpipe.video.stream import VideoFormat
 ENCODED_BY = "Encoding video"  # start of the error about a missing extra
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
 JPEG_QUALITY = 2  # FFmpeg's quantizer scale, on which 2 is the best quality
-RGB = "rgb24"  # FFmpeg's name
+RGB = "rgb24"  # FFmpeg's name of the RGB pixel format
 
 
 def jpeg_format(width_px: int, height_px: int, rate_hz: Fraction | None, pixel_format: str = "yuvj422p") -> VideoFormat:

@@ -34,7 +34,7 @@ DEMUXERS = {  # FFmpeg's demuxer by extension; the content does not choose it, b
     ".mp4": "mp4",
     ".webm": "matroska",
 }
-IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # FFmpeg's codec by extension
+IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # file extension -> FFmpeg's codec
 IMAGE_DEMUXERS = {"mjpeg": "jpeg_pipe", "png": "png_pipe", "webp": "webp_pipe"}
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
 WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files without presentation times

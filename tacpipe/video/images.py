@@ -34,7 +34,7 @@ class ImageShape(NamedTuple):
 
     width_px: int
     height_px: int
-    pixel_format: str  # FFmpeg's name
+    pixel_format: str  # FFmpeg's name of the pixel format
 
 
 def read_shape(image: bytes) -> ImageShape | None:
@@ -234,7 +234,7 @@ def _expect_alike(images: pa.Array, video_format: VideoFormat, first_row: int, p
     expected = (video_format.codec, video_format.width_px, video_format.height_px)
     for row, image in enumerate(images, first_row):
         actual_format = image_format(image.as_py()) if image.is_valid else None
-        if actual_format is None:  # an incomplete image is stored as it is; decoding it is an error
+        if actual_format is None:  # an incomplete image is stored unchanged, and decoding it raises an error
             continue
         if (actual_format.codec, actual_format.width_px, actual_format.height_px) != expected:
             raise TacpipeError(

@@ -182,6 +182,6 @@ def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int,
             f"Frame {start} cannot be decoded: no key frame precedes it. Record or export the video from a key frame on."
         )
     latest = np.maximum.accumulate(dts)  # (row,)
-    earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), of this row and all later ones
+    earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), earliest decoding time of this row and all later ones
     is_boundary = np.append(latest[:-1] < earliest[1:], True)  # whether a cut may follow each row
     return int(keys[-1]), stop + int(np.argmax(is_boundary[stop - 1 :]))

@@ -23,7 +23,7 @@ from tacpipe.viewer.contents import STRIP_FRAMES, DrawnContents, FrameStrip
 SUFFIXES = (".png", ".svg", ".pdf")
 WIDTH_IN, DPI = 11.0, 110
 STRIP_PX = 320  # minimum width of a drawn frame
-MAX_POINTS = 2400  # points per line: two per pixel
+MAX_POINTS = 2400  # maximum number of points per line: two per pixel
 BINS = 1200  # bins of the image of all taxels
 MAX_PANELS, MAX_LEGEND = 9, 8  # maximum numbers of drawn sets of curves, and of lines in a legend
 MAPS_A_ROW = 4

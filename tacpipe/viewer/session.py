@@ -177,7 +177,7 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-# height of the spans (the touch has 3): per lane, minimum and maximum
+# relative height of the panel of spans (the panel of touch has 3): per lane, minimum, maximum
 LANE_HEIGHT, MIN_HEIGHT, MAX_HEIGHT = 0.35, 1.1, 2.2
 MAPS_A_ROW = 3
 SHORT_S, LOOP_S = 20.0, 10.0  # a recording up to this length plays in full; duration that is played of a longer one

@@ -398,7 +398,7 @@ def state_changes(spans: Sequence[Span]) -> tuple[Times, list[str]]:
     >>> t_ns.tolist(), states
     ([0, 5, 7], ['x', 'y', ''])
     """
-    states: dict[int, str] = {}  # by time in ns
+    states: dict[int, str] = {}  # state by the time in ns at which it starts
     for span in sorted(spans, key=lambda member: member.start_ns):
         states[span.start_ns] = span.text
         for covered_ns in [t_ns for t_ns in states if span.start_ns < t_ns < span.stop_ns]:

@@ -154,7 +154,7 @@ class Dask:
             store = open_store(tasks[0].store, tasks[0].run)
             try:
                 for result in self._results(futures, tasks[0].name):
-                    if result.record is not None:  # the worker announces it too, but only until the worker ends
+                    if result.record is not None:  # the worker also announces it, but only until the worker ends
                         store.announce(records.digests(result.record["result"]))
                     yield result
             finally:

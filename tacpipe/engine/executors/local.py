@@ -83,7 +83,7 @@ def start_fork_server(preload: Sequence[str]) -> ForkServerContext:
     memory.require_library("pyarrow")  # each process loads it
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(list(preload))
-    resource_tracker.ensure_running()  # it unblocks signals, so it starts before they are blocked
+    resource_tracker.ensure_running()  # the tracker unblocks signals, so it starts before they are blocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
@@ -170,7 +170,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
         ours, theirs = server.Pipe()
         alive, life = server.Pipe(duplex=False)
         workers[ours] = life
-        # a worker that received half of a task would report an error
+        # otherwise, a worker that received half of a task would report an error
         with termination.deferred(), _explain_death(), without_main():
             server.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
         theirs.close()

@@ -36,7 +36,7 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
 LOOK_ROWS = 3  # number of rows read by `ArrayContainer.look`
-BLOCK_BYTES = 1 << 25  # number of bytes read at once; a larger chunk of the file is read as a whole
+BLOCK_BYTES = 1 << 25  # number of bytes read at once; larger chunks of a file are read completely
 OBJECT_BYTES = 200  # assumed size of a string in memory
 MASK = "mask"  # group with robomimic's lists of recordings
 MAX_DEPTH = 4  # maximum depth of JSON in attributes

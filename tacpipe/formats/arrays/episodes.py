@@ -117,7 +117,7 @@ def _episodes_from_ends(tree: Tree) -> list[Episode]:
             attributes = tree.attributes(group)
             names, has_names = attributes.get(NAMES), True
             if not isinstance(names, list) or len({str(name) for name in names}) != len(ends):
-                names = [f"episode_{number:06d}" for number in range(len(ends))]  # LeRobot's names
+                names = [f"episode_{number:06d}" for number in range(len(ends))]  # names in LeRobot's style
                 has_names = False
             labels = attributes.get(LABELS)
             return [

@@ -26,7 +26,7 @@ from tacpipe.video.stream import VideoFormat
 
 MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
 MAX_TEXT = 200  # maximum length of a text attribute; longer ones are files, such as a simulator's model
-IMAGE_SIDE = 32  # pixels that a picture has at least
+IMAGE_SIDE = 32  # minimum side of a picture in pixels
 IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
 DERIVED = "derived_from"  # attribute of an array that repeats another one, with its name
 
@@ -45,8 +45,8 @@ class ArrayDescription:
     dtype: np.dtype[Any]
     attributes: StoredAttributes = field(default_factory=dict)
     chunk_rows: int = 0  # rows of a chunk, or 0 if the file has none
-    problem: str = ""  # why it cannot be read, such as "is …"; empty if it can
-    time_axis: int = 0  # axis of the file's array that becomes the first axis of ``shape``
+    problem: str = ""  # why the array cannot be read, as a clause such as "is …"; empty if it can be read
+    time_axis: int = 0  # axis of the stored array that becomes the first axis of ``shape``
 
     @property
     def name(self) -> str:
@@ -285,7 +285,7 @@ def _rows_as_bytes(values: AnyArray) -> list[bytes]:
 
 
 AXES = ("x", "y", "z")
-BLOCK_BYTES = 1 << 20  # number of bytes transposed at once
+BLOCK_BYTES = 1 << 20  # number of bytes that are transposed at once
 
 
 def columns_of_array(

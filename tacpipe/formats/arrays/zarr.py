@@ -312,7 +312,7 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except OSError as error:
-            if error.errno != errno.EINVAL:  # an offset before the start of the file, because its table is damaged
+            if error.errno != errno.EINVAL:  # EINVAL: a damaged table has an offset before the start of the file
                 with regular.failing(path):
                     raise
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error

@@ -49,7 +49,8 @@ class Meaning:
     """How messages of a type are divided into parts, and which leaves are keys that name other values."""
 
     parts: Callable[[MessageShape], list[MessagePart]]
-    is_key: Callable[[Leaf], bool] = lambda leaf: False  # messages with different keys are decoded separately
+    # whether a value is a key: messages with different keys are decoded separately
+    is_key: Callable[[Leaf], bool] = lambda leaf: False
 
 
 def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
@@ -169,7 +170,7 @@ def is_bytes(leaf: Leaf) -> bool:
     """Return whether an array contains binary data, such as an image, rather than channels."""
     if leaf.kind not in ("uint8", "byte", "char", "int8") or leaf.count is None:
         return False
-    if leaf.enclosing[-1][1].startswith("tacpipe_msgs/"):  # exports write no other arrays of these types
+    if leaf.enclosing[-1][1].startswith("tacpipe_msgs/"):  # exported messages of these types have no other arrays
         return True
     arrays = "MultiArray" in leaf.enclosing[-1][1]
     return leaf.count > MAX_COLUMNS or (not arrays and leaf.path[-1] == "data")

@@ -220,7 +220,7 @@ def _decode_matrix(
     shape: MessageShape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
 ) -> Iterator[Block]:
     """Yield the block of each part of messages (message, byte) of one shape; ``rows`` are their positions in the batch."""
-    cache: dict[int, Any] = {}  # values by leaf offset: an array is viewed once for all of its columns
+    cache: dict[int, Any] = {}  # values by leaf offset, so that an array is read once for all of its columns
     for part in meaning.parts(shape):
         columns: dict[str, pa.Array] = {}
         about: dict[str, Mapping[str, str]] = {}

@@ -37,7 +37,7 @@ class BrokenRecordError(Exception):
 class TopicConnection:
     """A channel: a source of messages of one topic, with their type and encoding. A topic may have several channels."""
 
-    number: int  # channel number that messages refer to
+    number: int  # number of the channel, to which messages refer
     topic: str
     type: str  # name of the message type
     encoding: str  # message encoding: ros1, cdr, json, protobuf, …

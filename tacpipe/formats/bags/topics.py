@@ -48,7 +48,7 @@ class TopicRows:
         self._pieces: list[Piece] = []
         self._schema: pa.Schema = pa.schema([])
         self._about: dict[str, Mapping[str, str]] = {}
-        self._absent: set[str] = set()  # columns that some rows lack
+        self._absent: set[str] = set()  # columns that are missing in some rows
         self._headers_set = self._headers_unset = False
         self._apart_ns = 0  # maximum difference between header stamp and log time
         self._published_apart = False  # True if a publish time differs from its log time

@@ -45,7 +45,7 @@ class Leaf:
 
     path: Path
     kind: str  # a ROS type of `NUMBERS`, "text" or "stamp"
-    offset: int  # bytes from the start
+    offset: int  # offset in bytes from the start of the message
     count: int | None  # array length, text length in bytes, or None for a single number
     enclosing: tuple[tuple[int, str], ...]  # enclosing message types: path length and name
 
@@ -196,7 +196,7 @@ class _Walk:
     content: bytes
     types: Types
     shape: MessageShape
-    messages: int = 0  # messages walked, including those without fields
+    messages: int = 0  # number of visited messages, including those without fields
 
     def walk(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
         """Walk the fields of a message that starts at ``at`` and return its end.
@@ -224,7 +224,7 @@ class _Walk:
 
         Raises `struct.error` if the message ends before.
         """
-        end = at + self.shape.encoding.aligned  # ROS 1 writes nothing
+        end = at + self.shape.encoding.aligned  # ROS 1 writes nothing for an empty message
         if end > len(self.content):
             raise struct.error
         return end

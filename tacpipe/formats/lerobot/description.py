@@ -64,10 +64,10 @@ class EpisodeDescription:
 
     name: str
     index: int
-    file: str  # path in the dataset
+    file: str  # path of the frames in the dataset
     length: int
     tasks: tuple[str, ...] = ()
-    videos: Mapping[str, str] = field(default_factory=dict)  # path in the dataset by feature
+    videos: Mapping[str, str] = field(default_factory=dict)  # path of the video in the dataset, by feature
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     original: Mapping[str, Attribute] | None = None
     # start time in the video by feature, 0 if missing

@@ -168,7 +168,7 @@ class FileSample:
     values: Mapping[str, tuple[Any, ...]]  # first rows by column
     text: Dialect | None = None  # None if it is not a text file
     encoding: str = "utf-8"
-    arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # only for files of arrays
+    arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # arrays of a file of arrays; otherwise empty
     units: Mapping[str, str] = field(default_factory=dict)  # units by column, from a row below the header
     frames: int | None = None  # number of frames of a video or a folder of images
 
@@ -220,7 +220,7 @@ def _first_rows(
     names = [name for name in file.names() if not any(belongs_to(name, array) for array in pictures)]
     if isinstance(file, binary.JsonLines):
         columns = {name: file.head().column(name) for name in file.head().column_names}
-    elif isinstance(file, binary.NumpyArchive):  # its arrays may differ in length
+    elif isinstance(file, binary.NumpyArchive):  # the arrays of an archive may differ in length
         columns = {name: next(iter(file.batches({name: pa.null()}))).column(name) for name in names}
     else:
         block = next(iter(file.batches(dict.fromkeys(names, pa.string()))), pa.table({}))
@@ -334,7 +334,9 @@ def _kind(values: Sequence[float | str]) -> str:
         return "bool"
     if not all(isinstance(value, int | float) for value in values):
         return "text"
-    if any(isinstance(value, float) for value in values):  # also if all are like 2.0, because a later cell may be 2.5
+    if any(
+        isinstance(value, float) for value in values
+    ):  # also for values such as 2.0, because a later cell may be 2.5
         return "float64"
     numbers = [int(value) for value in values]
     return next(

@@ -111,7 +111,7 @@ class StreamLayout:
     """One stream of each recording."""
 
     name: str
-    files: str = ""  # empty for each container in the folder
+    files: str = ""  # pattern of paths; empty for each container in the folder
     time: Time = DECLARED  # a container's own time, unless a column or a rate is given
     columns: tuple[ColumnRule, ...] = ()  # for containers, only the rules that replace declared metadata
     format: Format | None = None  # None to derive it from the file's suffix
@@ -119,11 +119,11 @@ class StreamLayout:
     separator: str = ""  # empty for a comma, or a tab in .tsv files
     decimal: Literal[".", ","] = "."
     comment: str = ""  # prefix of lines to ignore
-    header: bool = True  # False if columns are named by ``names``, or column1, column2, …
+    header: bool = True  # False if the file has no header: columns are named by ``names``, or column1, column2, …
     names: tuple[str, ...] = ()  # column names, if ``header`` in the layout is a list
-    encoding: str = "utf-8"  # text files only
-    sheet: str = ""  # workbooks only; empty for the first sheet
-    time_axis: NonNegativeInt = 0  # arrays only: axis of the rows
+    encoding: str = "utf-8"  # encoding of text files
+    sheet: str = ""  # sheet of a workbook; empty for the first sheet
+    time_axis: NonNegativeInt = 0  # axis of the rows in arrays
     array: str = ""  # NPZ and NPY only: name of an array of decoded images, each of which is a row
     skip_lines: NonNegativeInt = 0  # number of lines above the header
     missing: tuple[str, ...] = ()  # cells that mean a missing value (NaN)
@@ -192,7 +192,7 @@ class LabelSource:
 
     file: str
     key: str = ""  # table column with the recording's name
-    columns: tuple[str, ...] = ()  # empty for all columns
+    columns: tuple[str, ...] = ()  # columns of the table; empty for all columns
 
 
 @dataclass(frozen=True)

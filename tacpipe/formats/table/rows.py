@@ -73,7 +73,7 @@ def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) 
 class CutIndex(TypedDict):
     """The index at the end of a `cut`."""
 
-    places: dict[str, list[tuple[int, int]]]  # first byte and bytes of each block by recording
+    places: dict[str, list[tuple[int, int]]]  # first byte and number of bytes of each block, by recording
     schema: str  # base64
 
 

@@ -127,7 +127,7 @@ DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # number of decimals that are nano
 DECIMAL = pa.decimal128(38, 18)  # type for parsing text
 _UNIT = 10**9  # a nanosecond in units of the last digit of `DECIMAL` seconds
 _USUAL = 450_000_000  # limit of the high word of seconds (year 2233) below which products fit in 64 bits
-_BEYOND = 10**37 >> 64  # limit of the high word that is after 2262 in every unit
+_BEYOND = 10**37 >> 64  # value of the high word above which a time is after 2262 in every unit
 _MAX_STAMP = 1e19  # after 2262 in every unit, and below the smallest number that Arrow misreads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, as written by Python's logging
@@ -283,7 +283,7 @@ def _from_floats(column: pa.Array, factor: int) -> Int64s:
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
     _refuse_flagged(pa.array(bad), column, IN_RANGE)
-    floors = np.floor(values)  # separately, because the product of the whole number with the factor would be rounded
+    floors = np.floor(values)  # whole part, handled separately because its product with the factor would be rounded
     t_ns: Times = floors.astype(np.int64) * factor + np.rint((values - floors) * factor).astype(np.int64)
     return t_ns
 

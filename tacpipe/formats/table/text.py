@@ -88,7 +88,7 @@ class _Recoded(io.RawIOBase):
         return count
 
 
-BLOCK_BYTES = 1 << 24  # below the size that the C library returns to the system each time
+BLOCK_BYTES = 1 << 24  # smaller than the blocks that the C library returns to the system after each use
 BOM = b"\xef\xbb\xbf"  # byte order mark that some editors write at the start
 MAX_LINE_BYTES = 1 << 24  # a file with longer lines is not a text table
 _NOT_BLANK = re.compile(rb"\S")

@@ -197,7 +197,7 @@ def _scales(
         cells = [row.get(key) for row in values for key in ("y", "low", "high")]
         plotted_values = [cell for cell in cells if isinstance(cell, float)]
         y_scale["domain"] = [max(floor, min([0.0, *plotted_values])), max([0.05, *plotted_values])]
-    if diagonal:  # the margin prevents that points at its ends are clipped
+    if diagonal:  # the margin prevents clipping of points at the ends of the diagonal
         margin = ROOM * (diagonal[1] - diagonal[0])
         y_scale["nice"] = False
         y_scale["domain"] = x_scale["domain"] = [short(diagonal[0] - margin), short(diagonal[1] + margin)]

@@ -20,7 +20,7 @@ from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Frames, Sensor
 
 CAN_BYTES = 13  # size of a CAN frame of a link
-NEIGHBOURS = 8  # good frames on both sides: more than any framer needs to lock
+NEIGHBOURS = 8  # number of good frames on both sides of a fault: more than any framer needs to lock
 
 
 def is_undetectable(sensor: Sensor, frames: Sequence[bytes], row: int, harmed: bytes) -> bool:

@@ -97,7 +97,7 @@ def _device(folder: Path, name: str) -> Path:
 
 POLL_NS = 20_000_000  # period of polling for events without a descriptor
 FILL_S = 0.1  # period of planning frames ahead
-MAX_WAIT_S = 0.02  # longest wait
+MAX_WAIT_S = 0.02  # maximum wait
 CAMERA_HZ = 25.0  # default rate of cameras
 DEFAULT_HZ = 2.0  # rate of sensors without a declared rate, such as clouds
 

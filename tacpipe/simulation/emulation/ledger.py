@@ -71,7 +71,7 @@ class LedgerEntry:
     """A frame that was or should have been sent."""
 
     due_ns: int  # time on this computer's monotonic clock
-    sent_ns: int  # the same for the actual time; 0: it was not sent
+    sent_ns: int  # actual time on the same clock; 0: it was not sent
     number: int  # number of the sample in its source; -1 if it is not a frame
     size: int  # sent bytes
     cause: str
@@ -215,7 +215,7 @@ class ClockTruth(TypedDict):
 
     offset_ns: float
     skew: float
-    set_at_ns: Sequence[int]  # when the clock was set
+    set_at_ns: Sequence[int]  # times at which the clock was set, in ns
 
 
 def _clock(source: Sampled) -> ClockTruth:
@@ -225,7 +225,7 @@ def _clock(source: Sampled) -> ClockTruth:
     return {"offset_ns": timing.clock.offset_ns, "skew": timing.clock.skew, "set_at_ns": moments_ns}
 
 
-STAMPS = ("t_ns", "t_uncertain_ns", "t_device_ns", "seq", "device_seq")  # columns of a stream that are no channels
+STAMPS = ("t_ns", "t_uncertain_ns", "t_device_ns", "seq", "device_seq")  # columns of a stream that are not channels
 
 
 def sent_columns(samples: Samples) -> list[AnyArray]:

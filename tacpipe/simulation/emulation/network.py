@@ -252,7 +252,7 @@ class Websocket(Tcp):
 
 
 MAX_DATAGRAM_BYTES = 65_536
-MAX_QUEUED_BYTES = 65_536  # bytes, of the default queue size of 200 KiB
+MAX_QUEUED_BYTES = 65_536  # maximum number of queued bytes, of the default queue size of 200 KiB
 
 
 class Correspondent:

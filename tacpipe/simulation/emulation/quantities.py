@@ -261,7 +261,7 @@ COUNTS = {  # counts at full range, by type
     "uint32": 1e5,
     "int32": 1e6,
 }
-FLOAT_COUNTS = 100.0  # the same for float fields
+FLOAT_COUNTS = 100.0  # counts at full range of float fields
 FULL = {  # full range in SI units of devices that send counts
     "tactile": 12.0, "magnetic_flux_density": 12.0, "displacement": 12.0, "static_pressure": 10.0, "vibration": 0.5,
     "force": 15.0, "torque": 1.0, "temperature": 60.0, "acceleration": 20.0, "angular_velocity": 5.0, "proximity": 0.5,

@@ -158,7 +158,7 @@ class Change(ForwardModelParams):
 class Recurrent(ForwardModelParams):
     """Params of the paper's model, which predicts levels, has no dropout and minimises the squared error."""
 
-    # recurrent: the paper's network
+    # recurrent: the recurrent network of the paper
     architecture: Literal["recurrent"] = "recurrent"
     PRESETS: ClassVar[Presets] = {
         "paper": {
@@ -188,7 +188,7 @@ PAPER = Recurrent.architecture  # architecture of the paper
 class CodecDescription(TypedDict):
     """Representation that a model reads, in its configuration."""
 
-    kind: str  # name in `tacpipe compress`; raw: no codec
+    kind: str  # name of the codec in `tacpipe compress`; raw: no codec
     of: str  # levels or increments
     frames: int
     latents: int
@@ -210,7 +210,7 @@ class ModelInputs(TypedDict):
     orientation_reference: list[float]  # (4,), quaternions have the sign that is nearest to this one
     plan_velocity: NotRequired[str]  # source of a plan's velocities; absent: same source as past velocities
     unit: NotRequired[str]  # unit of the channels; absent: counts
-    pose: NotRequired[ArmColumns]  # absent: columns of a Panda
+    pose: NotRequired[ArmColumns]  # columns of the arm; absent: those of a Panda
 
 
 class ForwardScaling(TypedDict):

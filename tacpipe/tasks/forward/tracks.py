@@ -335,7 +335,7 @@ def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloat
     arm = storage.empty((count, len(ARM)), np.float32)
     plan_velocity = storage.empty((count, len(ARM) - POSED), np.float32) if angles else None
     signs = kinematics.SignContinuation()
-    before = slice(0, 0)  # the row before a batch
+    before = slice(0, 0)  # range with the row before a batch
     t_ns, placed = np.zeros(0, np.int64), np.zeros((0, POSED))
     first = 0
     for batch in table.batches(["t_ns", *pose.position, *pose.orientation, *angles, *speeds]):

@@ -189,7 +189,7 @@ def _shrinkage(
     starts = validation_rows.evenly_spread(SHRINKING)
     windows, ahead = validation_rows.pick(starts)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(params.seed)  # plans may be shuffled
+        torch.manual_seed(params.seed)  # the seed matters because plans may be shuffled
         windows = ForecastWindows(*(part.cpu() for part in with_actions(windows, validation_rows.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
     return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, validation_rows.recording_of(starts))}

@@ -37,7 +37,7 @@ class BatchPairs:
     classes: Mapping[str, Tensor]  # sensor -> class of each slide, from 0; NONE for slides without label
     batch: int
     pairing: str = "random"  # random: new pairs in each epoch; fixed: drawn once; permuted: random, of other classes
-    shuffle: bool = True  # new batches in each epoch; without, pairs are fixed as well
+    shuffle: bool = True  # whether new batches are drawn in each epoch; otherwise, pairs are also fixed
     drop_last: bool = False  # omit the last batch if it is not full
     subsample_sensor: str = ""  # sensor that learns only from a subset of the batches
     subsample_percent: int = 100  # percentage of the batches

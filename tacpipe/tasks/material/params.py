@@ -248,7 +248,7 @@ class NetworkParams(MaterialModelParams, ABC):
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # sensor that learns from only a part of the batches; needs --no-shuffle
     subsample_sensor: Annotated[str, StoredAs("reduce")] = ""
-    # percentage of the batches that it learns from
+    # percentage of the batches that this sensor learns from
     subsample_percent: Annotated[Literal[100, 90, 50, 25, 17, 11], StoredAs("ratio")] = 100
     # network before a sensor's LSTM, such as biotac=mlp, or other=mlp for all sensors without a 6 x 10 grid; by default
     # cnn for such a grid, else none
@@ -262,7 +262,7 @@ class NetworkParams(MaterialModelParams, ABC):
     learning_rate: PositiveFloat = 5e-4  # learning rate of Adam
     cycle: bool = False  # raise and lower the learning rate once over all epochs
     patience: NonNegativeInt = 0  # epochs without a better validation accuracy after which training ends; 0: all epochs
-    shuffle: bool = True  # other batches every epoch
+    shuffle: bool = True  # draw new batches in every epoch
     drop_last: bool = False  # omit the last incomplete batch, also in evaluation, as the published code does
     # weights to keep: best, of the highest validation accuracy; last, of the last epoch
     select: Literal["best", "last"] = "best"
@@ -340,7 +340,7 @@ class NetworkParams(MaterialModelParams, ABC):
 class Raec(NetworkParams):
     """The paper's recurrent autoencoder with a classifier, trained jointly for different sensors or separately."""
 
-    # raec: the paper's recurrent autoencoder
+    # raec: the recurrent autoencoder of the paper
     architecture: Literal["raec"] = "raec"
     TITLE: ClassVar[str] = "RAEC"
     ALIGNS_SENSORS: ClassVar[bool] = True
@@ -351,9 +351,10 @@ class Raec(NetworkParams):
     pairing: Literal["random", "fixed", "permuted"] = "random"
     # alignment loss: pairs of one material, or contrast with all other slides too
     alignment_loss: Annotated[Literal["pairs", "contrast"], StoredAs("agreement")] = "pairs"
-    decoder: Literal["D1", "D2"] = "D1"  # D1: latents are its first state; D2: they are its input at every step
-    latents: PositiveInt = 40  # numbers that a slide is encoded to
-    # how a cnn is undone: nearest; last, with the last frame's indices, as published
+    # D1: latents are the decoder's first state; D2: they are its input at every step
+    decoder: Literal["D1", "D2"] = "D1"
+    latents: PositiveInt = 40  # number of values that represent a slide
+    # how the pooling of a cnn is reversed: nearest; last, with the last frame's indices, as published
     unpool: Literal["nearest", "last"] = "nearest"
     reconstruction_weight: NonNegativeFloat = 0.01  # weight of the squared error of reconstructed slides
     classification_weight: NonNegativeFloat = 1.0  # weight of the negative log-likelihood of classes
@@ -514,7 +515,7 @@ class UnknownDescription(TypedDict):
     threshold: float
     false_unknown: float
     auroc_left_out: dict[Literal["probability", "distance"], float]
-    calibration_error: dict[str, float]  # before and after calibration
+    calibration_error: dict[str, float]  # calibration error before and after calibration
 
 
 class MaterialConfig(ModelConfig, StoredNaming):

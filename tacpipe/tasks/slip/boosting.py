@@ -25,8 +25,8 @@ class BoostedTrees:
     roots: Int32s  # (tree,)
     children: Int32s  # (node, left or right); LEAF at a leaf
     features: Int32s  # (node,)
-    cuts: Floats  # (node,); a row goes left where its feature is at most that
-    missing_left: Int32s  # (node,), 1 where a row without the feature goes left
+    cuts: Floats  # (node,); a row goes left if its feature is at most this
+    missing_left: Int32s  # (node,), 1 if a row without the feature goes left
     values: Floats  # (node,)
     base: Floats  # (1,), the score before the first tree
 
@@ -71,7 +71,9 @@ class BoostedTrees:
         cuts = nodes["num_threshold"].copy()
         for feature, values in enumerate(edges):
             chosen = (nodes["feature_idx"] == feature) & ~is_leaf & np.isfinite(cuts)
-            cuts[chosen] = values[np.ceil(cuts[chosen]).astype(np.intp) - 1]  # a cut is between two numbers of bins
+            cuts[chosen] = values[
+                np.ceil(cuts[chosen]).astype(np.intp) - 1
+            ]  # a cut is the midpoint between two bin numbers
         pairs = np.column_stack([nodes["left"], nodes["right"]]).astype(np.int64) + offsets[:, None]
         return cls(
             starts.astype(np.int32),

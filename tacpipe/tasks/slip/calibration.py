@@ -19,7 +19,7 @@ from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
 
 RATES = (0.1, 1.0, 10.0)  # false alarms per minute of stable contact
 LEVELS_TRIED = 512
-PRIOR = 1.0  # windows of each kind that are added to each end, so that no probability is 0 or 1
+PRIOR = 1.0  # number of windows of each kind that are added to each end, so that no probability is 0 or 1
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ScoredTrack:
     states: Int64s  # (row,), as `GraspTrack.states` returns them
     scores: Floats  # (row,)
     events: Times  # (event, 2)
-    weights: Floats  # (row,), 0 where a row is not matched in time
+    weights: Floats  # (row,), 0 for a row without a match in time
     since_s: Floats  # (row,)
 
 
@@ -153,7 +153,7 @@ class EventScore:
 
     name: str  # recording
     object: str
-    begins_s: float  # since the start of the recording
+    begins_s: float  # time in s since the start of the recording
     lead_ms: float  # time from the first alarm in the horizon before the slip; NaN without one
     detected_ms: float  # time from the slip's start to the first alarm; NaN without one before its end
     to_end_ms: float  # time from the first alarm to the end of the slip; NaN without an alarm

@@ -14,7 +14,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Floats, Indices
 
 CYCLES = (1, 2, 3, 5, 8, 12)  # cycles per window of the spectrum
-EPSILON = 1e-9  # smallest divisor
+EPSILON = 1e-9  # minimum divisor
 PRESSED = 0.2  # fraction of the largest normal load of a finger above which a taxel counts as pressed
 Layout = Sequence[Mapping[str, str]]
 

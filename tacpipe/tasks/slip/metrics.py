@@ -21,8 +21,8 @@ from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
 LEADS_S = (0.2, 0.5, 1.0)  # times before the start of a slip at which the area under the curve is measured
 LEAD_WIDTH_S = 0.1  # half the width of the windows around such a time
 EARLY_S = (2.0, 3.0)  # times before the start of a slip of the control of windows that are too early
-ROUNDING = 1e-9  # largest standard error that counts as none
-SMALLEST_SHARE = 1e-3  # smallest share, and smallest distance from 1, that is transformed to log odds
+ROUNDING = 1e-9  # standard error up to which it counts as zero
+SMALLEST_SHARE = 1e-3  # minimum share, and minimum distance from 1, for the transformation to log odds
 SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 PARTS = {  # kinds of windows of the area under the curve -> meaning
@@ -46,12 +46,12 @@ class SlipAlarmScore(TypedDict):
     """Score of an alarm over all slips."""
 
     events: int
-    predicted: int  # slips with an alarm before they began
-    detected: int  # slips with an alarm before they ended, including predicted ones
+    predicted: int  # number of slips with an alarm before their start
+    detected: int  # number of slips with an alarm before their end, including predicted slips
     median_lead_ms: float | None  # time from the alarm to the start of the slip, for predicted slips
     median_to_end_ms: float | None  # time from the alarm to the end of the slip, for detected slips
     false_alarms: int
-    minutes: float  # stable contact
+    minutes: float  # duration of stable contact
     false_alarms_per_minute: float | None
     predicted_ratio: ObjectEstimate
     detected_ratio: ObjectEstimate

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 KERNEL = 3
 HELD_OUT = 5  # every fifth object stops the training early
 GRADIENT_CLIP = 1.0
-LIMIT = 10.0  # largest scaled value
+LIMIT = 10.0  # maximum scaled value
 MAX_WIDTH = 4096  # maximum number of channels of a stored network
 
 

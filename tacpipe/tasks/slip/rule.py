@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
 
 STEPS = (1, 3, 5, 10)  # steps ahead of the forecasts
-SMALLEST_LOAD = 1e-3  # smallest divisor, as a fraction of the largest load of a recording
+SMALLEST_LOAD = 1e-3  # minimum divisor, as a fraction of the largest load of a recording
 
 
 def rise_and_fall(shear: AnyFloats, load: AnyFloats) -> Floats:

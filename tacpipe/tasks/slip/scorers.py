@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 LINEAR = "linear"  # name of the linear baseline
 PENALTY = 0.01  # L2 penalty on the weights of the linear baseline, relative to the mean error of a window
-LARGEST = 10.0  # largest standardised feature that the linear baseline reads
+LARGEST = 10.0  # maximum standardised feature, to which the linear baseline clips
 
 
 class Scorer(Protocol):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.slip.params import FingerConfig, SlipModelParams
 
 STABLE, BEFORE, DURING, UNCOUNTED = 0, 1, 2, -1  # states of a row
-BLOCK = 256  # windows whose features are computed at once
+BLOCK = 256  # number of windows whose features are computed at once
 TIME = "time since the start"  # last column of the features, which only the baseline time_only reads
 MATCH_NS = 1_000_000_000  # width of the bins of time since the start in which windows are matched
 
@@ -43,7 +43,7 @@ class Finger:
     stream: str
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
-    rows: int  # rows of a window
+    rows: int  # number of rows of a window
     rate_hz: float
     scale: Floats  # (channel,)
 
@@ -81,8 +81,8 @@ class FingerRows:
     """The rows of a finger in one recording."""
 
     t_ns: Times  # (row,)
-    values: AnyFloats  # (row, channel), above rest and scaled; NaN is replaced by the value before
-    begin: int  # first row after the level at rest is measured
+    values: AnyFloats  # (row, channel), above rest and scaled; NaN is replaced by the previous value
+    begin: int  # first row after the rest level is measured
 
 
 def measure_rest(t_ns: Times, values: AnyFloats, rest_ns: int) -> tuple[Floats, int] | None:
@@ -138,16 +138,16 @@ class GraspTrack:
     """A recording as rows of its first finger."""
 
     name: str
-    object: str  # what is held; the name of the recording if it is unlabelled
+    object: str  # grasped object; the name of the recording if it is unlabelled
     digest: str
     t_ns: Times  # (time,)
-    start_ns: int  # first sample of any finger
+    start_ns: int  # time of the first sample of any finger
     fingers: tuple[FingerRows, ...]
     newest: Indices  # (time, finger), the newest row of each finger
     ready: Bools  # (time,), whether all windows are full
     labels: SlipLabels | None
-    recording: Recording | None = None  # as it was opened
-    plans: PlannedMotion | None = None  # None if the model reads none, or the recording has none
+    recording: Recording | None = None  # the recording of the track, if it was read from one
+    plans: PlannedMotion | None = None  # planned motion; None if the model reads no plans, or the recording has none
 
     @property
     def since_s(self) -> Floats:
@@ -408,8 +408,8 @@ class TrainingWindows:
     reader: FingerReader
     tracks: tuple[GraspTrack, ...]
     params: SlipModelParams
-    track: Indices  # (window,), index of its track
-    rows: Indices  # (window,), row of its track
+    track: Indices  # (window,), index of the window's track
+    rows: Indices  # (window,), row in the window's track
     features: Floats  # (window, feature); the last column is the time since the start
     slips: Bools  # (window,), whether the object slips within the horizon
     weights: Floats  # (window,)

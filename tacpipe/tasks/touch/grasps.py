@@ -36,7 +36,7 @@ class Grasps:
     clouds: tuple[Cloud, ...]
     grasps: tuple[Grasp, ...]
     readings: Mapping[str, Floats]  # target -> (grasp, value), device counts; empty without readings
-    digests: tuple[str, ...]  # of the recordings
+    digests: tuple[str, ...]  # digests of the recordings
 
     def __len__(self) -> int:
         """Return the number of grasps."""

@@ -47,7 +47,7 @@ class TouchModelParams(ABC):
     ARCHITECTURES: ClassVar[str] = "touch"  # name of the task in entry points
     TITLE: ClassVar[str] = ""  # name in reports; empty: the architecture
     architecture: str = "tree-ensemble"
-    targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
+    targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # targets: pressure and electrodes of thumb and middle finger
     # name of this run in a report, to distinguish runs of the same method, such as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
     seed: Seed = 0  # random seed of initial weights, the order of grasps, drawn points and cuts
@@ -141,11 +141,11 @@ class Trees(TouchModelParams):
 class PointNetwork(TouchModelParams, ABC):
     """Params of all networks that read points."""
 
-    # one network for all targets; else one each, as in the paper
+    # whether one network predicts all targets; otherwise one network per target, as in the paper
     multi_target: Annotated[bool, StoredAs("together")] = True
-    networks: PositiveInt = 3  # networks of other initial weights, whose mean is the prediction
+    networks: PositiveInt = 3  # number of networks with different initial weights, whose mean is the prediction
     points: Draws = 128  # number of points sampled from each cloud, or patch, at each visit
-    draws: Draws = 4  # draws of points over which a prediction is averaged
+    draws: Draws = 4  # number of draws of points over which a prediction is averaged
     # balanced: squared error in which all targets count the same; rmse of normalised values, the paper's
     loss: Literal["balanced", "rmse"] = "balanced"
     epochs: PositiveInt = 40  # passes over the training grasps
@@ -249,7 +249,8 @@ class Pointnet(PointNetwork):
     rotation_deg: Annotated[float, Range(0, 180), Unit("degrees")] = 0.0
     # rotation of the wrist: as recorded, or estimated from closing axis and line of sight
     wrist: Literal["given", "estimated"] = "given"
-    head: Literal["fc1", "fc2", "fc3", "fc4", "fc5", "fc6"] = "fc3"  # fully connected layers
+    # head of the network: number of fully connected layers
+    head: Literal["fc1", "fc2", "fc3", "fc4", "fc5", "fc6"] = "fc3"
     transform: bool = True  # transform all channels of a cloud first, by a learned map
     PRESETS: ClassVar[Presets] = {
         "paper": {

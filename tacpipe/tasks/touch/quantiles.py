@@ -63,7 +63,7 @@ class ReadingQuantiles:
         model_offsets, constant_offsets, object_offsets = {}, {}, {}
         for target, values in predicted.items():
             training_values = training.readings[target]
-            unit = np.maximum(training_values.std(axis=0), 1.0)  # at least one count
+            unit = np.maximum(training_values.std(axis=0), 1.0)  # the unit is at least one count
             errors = (calibration.readings[target] - values) / unit
             model_offsets[target] = _quantiles(errors, levels, promised)[:, None] * unit
             constant_offsets[target] = np.quantile(training_values - training_values.mean(axis=0), levels, axis=0)

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 
 PERIODS = 2.0  # periods without a forecast after which a message reports the cause
-SLACK_NS = 5_000_000  # additional time for jitter
+SLACK_NS = 5_000_000  # additional time that is allowed for jitter
 EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
-LITTLE_NS = 300_000  # minimum wait until then for which the process sleeps
+LITTLE_NS = 300_000  # minimum wait for which the process sleeps instead of polling
 STARTING_S = 0.005  # wait between two attempts while the grid is unknown
 
 

@@ -76,7 +76,7 @@ class InputLayout:
     orientation: Place | None
     joints: tuple[Place, Place] | None  # angles and speeds
     finger: Place | None
-    position_m: Floats  # (3,), metres per unit of each coordinate
+    position_m: Floats  # (3,), size of each coordinate's unit in metres
     finger_scale_m: float
     # stream -> indices of columns in batches
     _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)
@@ -219,7 +219,7 @@ class InputLayout:
         """Return each channel's rest level (channel,) from rows at rest, by the params of `segment contacts`."""
         stacked = np.stack(rows)  # (row, channel)
         levels = np.empty(stacked.shape[1])
-        t_ns = np.zeros(len(rows), np.int64)  # equal times, so that all rows are used
+        t_ns = np.zeros(len(rows), np.int64)  # equal timestamps, so that the rest level uses all rows
         for stream, (_, channels) in self.tactile_of.items():
             values = stacked[:, channels].astype(self.kinds[stream])
             levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])

@@ -83,7 +83,7 @@ class ForecastMessage(messages.Message):
     t_ns: int  # time of the grid point, UTC as in the recording
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
     cause: str = ""  # reason why there is no forecast, or the missing input
-    flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
+    flags: int = 0  # the cause as flags of `tacpipe.tasks.forward.live.chain.Cause`
     made_from_t_ns: int = 0  # arrival of the newest sample that was read
     latency_ms: float = math.nan
     age_ms: float = math.nan

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 POSITION, ORIENTATION = "target_position", "target_orientation"  # quantities
 SPAN_NS = 20_000_000  # span over which the set-point's speed is computed
-OLD_NS = 50_000_000  # maximum age of the newest set-point; an older one is no plan
+OLD_NS = 50_000_000  # maximum age of the newest set-point; older ones are not used as a plan
 AS_OPTIONS = "target_TCP_pose among the outputs of ur-rtde, RSol among those of kuka-rsi, targets = true of franka"
 
 

@@ -105,7 +105,7 @@ class Representation:
 
     validation: Spread
     test: Spread
-    known: Spread | None  # only test recordings of known objects
+    known: Spread | None  # error on test recordings of known objects
     persistence: Spread
 
 

@@ -95,7 +95,7 @@ def _confusion_chart(method: Method, sensor: str) -> Chart:
     return Chart(f"{sensor_title(sensor)}: {method.name}", spec, caption)
 
 
-Points = dict[int, tuple[float, float, float]]  # number of training slides -> accuracy and its bounds
+Points = dict[int, tuple[float, float, float]]  # number of training slides -> accuracy, and the bounds of its interval
 
 
 def training_folds(methods: Sequence[Method]) -> list[Fold]:

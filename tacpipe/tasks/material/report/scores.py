@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 class Accuracy:
     """Fraction of correctly classified slides, pooled over runs."""
 
-    correct: int  # sum over all runs
+    correct: int  # number of correct slides, summed over all runs
     evaluated: int
     slides: int  # number of distinct slides
     low: float  # 95 % Wilson interval over slides
     high: float
-    sd: float  # over runs; NaN for a single run
+    sd: float  # standard deviation over runs; NaN for a single run
     runs: int
 
     @property
@@ -79,7 +79,7 @@ class MethodDifference:
 
     slides: int
     gain: Gain  # in percentage points
-    first_only: int  # slides that only the first classifies correctly
+    first_only: int  # number of slides that only the first method classifies correctly
     second_only: int
     mcnemar: float  # p-value
     runs: PairedRuns

@@ -32,19 +32,19 @@ from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.windows import GraspTrack
 
 TRIALS, TRAINING_SEED = 80, 0
-EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
-SEED = 7  # of the emulated world
-LIVE_S = 60.0  # time of the emulated trials
-IDLE_S = 20.0  # time before them with open fingers, in which the session starts and measures the level at rest
+EFFORT = 1.15  # ratio of the plan's largest load to the friction limit: each trial slips because of its plan
+SEED = 7  # seed of the emulated world
+LIVE_S = 60.0  # duration of the emulated trials
+IDLE_S = 20.0  # duration before the trials with open fingers, in which the session starts and measures the rest level
 PLAN_RATE_HZ = 10.0  # plans per second
-PER_MINUTE = "1"  # false alarms that the alarm was set for
+PER_MINUTE = "1"  # false alarms per minute for which the alarm's level was set
 TRAINING = (
     *("--streams", "xela*", "--window-s", "0.5", "--horizon-s", "0.3", "--recovery-s", "0.3", "--no-match-time"),
     *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2", "--actions", "planned"),
 )
 VALIDATION = ("--val", "0.25", "--test", "0")  # validation recordings set the level of the alarm
 SWITCH_S = 0.0005
-BEFORE_MS, AFTER_MS = 500.0, 200.0  # time around a slip that is drawn enlarged
+BEFORE_MS, AFTER_MS = 500.0, 200.0  # duration around a slip that is drawn enlarged
 MAX_DRAWN_SLIPS = 6
 LINE, ALARM, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
 

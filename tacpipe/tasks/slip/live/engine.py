@@ -29,10 +29,10 @@ from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.planned import PlannedMotion
 from tacpipe.tasks.slip.windows import Finger, fill_missing, measure_rest
 
-EVERY_NS = 1_000_000  # time between two looks at new samples
-BEHIND = 4  # probabilities that are computed at once; older ones are skipped
+EVERY_NS = 1_000_000  # time between two checks for new samples
+BEHIND = 4  # maximum number of probabilities that are computed at once; older ones are skipped
 SILENT_NS = 250_000_000  # time without a sample after which a message reports it
-SPARE_ROWS = 512  # rows that are kept in addition to a window
+SPARE_ROWS = 512  # number of rows that are retained in addition to a window
 DIGITS = 4  # decimal places of published touch
 
 
@@ -54,12 +54,12 @@ class FingerSoFar:
         """Start without rows; ``rest`` are levels that were measured before, None to measure them over ``rest_ns``."""
         self.finger, self.rest_ns = finger, rest_ns
         self.rest: Floats | None = np.array(rest) if rest is not None else None
-        self._first: list[tuple[Times, AnyFloats]] = []  # batches before the level at rest is measured
+        self._first: list[tuple[Times, AnyFloats]] = []  # batches of rows before the rest level is measured
         self._filled = np.zeros(len(finger.scale))  # the newest value of each channel
         self.t_ns: Times = np.zeros(0, np.int64)
         self.values: AnyFloats = np.zeros((0, len(finger.scale)))
-        self._dropped = 0  # rows that are no longer kept
-        self._begin = 0  # first row after the level at rest
+        self._dropped = 0  # number of rows that have been dropped
+        self._begin = 0  # first row after the rest level was measured
 
     def add(self, t_ns: Times, raw: AnyFloats) -> None:
         """Append rows with times (row,) and values (row, channel). They are buffered until the rest level is measured."""
@@ -115,7 +115,7 @@ class SlipEngine(Engine):
         self._plans = PlannedMotion()
         self._pending: deque[int] = deque()  # times of samples of the first finger without a probability
         self._read_ns = 0  # time of the newest probability
-        self._heard_ns: int | None = None  # monotonic, of the latest message
+        self._heard_ns: int | None = None  # monotonic time of the latest message
         self._why = ""
         self._restart()
 

@@ -86,7 +86,7 @@ class SessionAlarms:
 
     events: list[EventScore]
     false_alarms: int
-    minutes: float  # stable contact
+    minutes: float  # duration of stable contact
 
     def to_json(self) -> dict[str, Any]:
         """Return the measures as a JSON object, with null for NaN."""

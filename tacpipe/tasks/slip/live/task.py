@@ -103,7 +103,8 @@ class SlipLive(LiveTask):
         if loaded.reader.reads_plans:
             windows.append(PlannedMotion().ahead(0))
             streams.append(PLAN)
-        loaded.scorer.score_window(loaded.reader, windows)  # imports and allocates what the first sample would wait for
+        # this imports and allocates everything, so that the first sample does not wait
+        loaded.scorer.score_window(loaded.reader, windows)
         return SlipEngine(
             loaded,
             {stream: sensors[stream] for stream in streams},
