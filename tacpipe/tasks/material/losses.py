@@ -93,7 +93,7 @@ class BatchPairs:
     def _pair_rows(self, generator: torch.Generator | None) -> Tensor:
         """Return slide indices (sensor, row): rows of one class each, then one row per slide without a label.
 
-        `NONE` stands for a missing slide.
+        The index of a missing slide is `NONE`.
         """
         blocks = []
         first = next(iter(self.classes.values()))
