@@ -15,12 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, PositiveInt, Range, Seed
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Result, stage
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.plugins.stage import Result
 
 LEVELS = CommaList(PositiveInt, min_items=1)
 
@@ -41,8 +41,6 @@ class Params:
 def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None) -> Result:
     """Return the files of the model with its uncertainty."""
     from tacpipe.datasets import model_files
-    from tacpipe.errors import UsageError
-    from tacpipe.plugins.stage import Result
     from tacpipe.tasks.task import CalibrationRequest
 
     task = model_files.task(model.files)

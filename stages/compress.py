@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, StoredAs
 from tacpipe.plugins.params import Panels
-from tacpipe.plugins.stage import Presets, stage
+from tacpipe.plugins.stage import Fitted, Presets, Result, Workspace, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.plugins.stage import Fitted, Result, Workspace
 
 Representation = Annotated[Literal["levels", "increments"], StoredAs("of")]
 
@@ -73,7 +72,6 @@ class AutoencoderParams:
 def fit(params: Params, train: Dataset) -> Result:
     """Return the principal components of the rows in contact outside of gaps, from the training recordings."""
     from tacpipe.codecs import pca, training_rows
-    from tacpipe.plugins.stage import Result
 
     rows = training_rows.stored_rows(train.recordings, params.representation)
     latents, notes = _latent_count(params.components, len(rows.channels))
@@ -87,7 +85,6 @@ def fit(params: Params, train: Dataset) -> Result:
 def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
     """Return the autoencoder trained on the rows in contact outside of gaps, from the training recordings."""
     from tacpipe.codecs import autoencoder_fit, training_rows
-    from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
 
     tried = autoencoder_fit.candidate_networks(

@@ -18,13 +18,13 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe.errors import UsageError
 from tacpipe.metrics import headline
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Result, stage
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.plugins.stage import Result
     from tacpipe.tasks.task import Task
 
     Model = Dataset
@@ -62,7 +62,6 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
 def _evaluate_sessions(task: Task, model: Model, recordings: Dataset) -> Result:
     """Return the evaluation of live sessions. Raises `UsageError` if models of the task do not run live."""
     from tacpipe.datasets import model_files
-    from tacpipe.errors import UsageError
 
     if task.live is None:
         raise UsageError(f"Models of the task {task.name} do not run live; leave --live out.")

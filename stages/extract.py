@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import numpy as np
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io.hashing import file_digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
-from tacpipe.plugins.stage import RecordingOutput, stage
+from tacpipe.plugins.stage import Fitted, RecordingOutput, Result, Workspace, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from tacpipe.codecs.frame_autoencoder import Encode
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
-    from tacpipe.plugins.stage import Fitted, Result, Workspace
     from tacpipe.video.channels import FrameChannels
     from tacpipe.video.stream import VideoFormat
 
@@ -137,7 +137,6 @@ def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: W
     Raises `TacpipeError` if there are fewer than two, or no frames.
     """
     from tacpipe.codecs import frame_autoencoder
-    from tacpipe.plugins.stage import Result
     from tacpipe.training.loop import Schedule
 
     recordings = [params.narrow(recording) for recording in train.recordings.values()]
@@ -363,8 +362,6 @@ def _feature_fields(count: int) -> list[pa.Field]:
 
 def _sha256(path: str) -> str:
     """Return the sha256 of a file. Raises `UsageError` if it cannot be read."""
-    from tacpipe.io.hashing import file_digest
-
     try:
         return file_digest(Path(path)).removeprefix("sha256:")
     except OSError as error:

@@ -13,15 +13,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, PositiveInt
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import stage
-from tacpipe.tasks.task import PredictionRequest
+from tacpipe.plugins.stage import Result, stage
+from tacpipe.tasks.task import PredictionRequest, Task
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.plugins.stage import Result
-    from tacpipe.tasks.task import Task
 
 STEPS = CommaList(PositiveInt, min_items=1)
 
@@ -64,8 +63,6 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
 
 def _require_uncertainty(task: Task, request: PredictionRequest) -> None:
     """Raise `UsageError` for a kind of uncertainty that the task's models do not provide."""
-    from tacpipe.errors import UsageError
-
     requested = {"quantiles": bool(request.quantiles), "probabilities": request.probabilities}
     for name in [name for name, is_requested in requested.items() if is_requested]:
         if task.calibration is None or task.calibration.states != name:
@@ -75,7 +72,6 @@ def _require_uncertainty(task: Task, request: PredictionRequest) -> None:
 def _predict_causally(task: Task, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
     """Return predictions as a live session would make them. Raises `UsageError` if models of the task do not run live."""
     from tacpipe.datasets import model_files
-    from tacpipe.errors import UsageError
 
     if task.live is None:
         raise UsageError(f"Models of the task {task.name} do not run live; leave --causal out.")

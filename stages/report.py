@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.constraints import NonNegativeInt
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Result, stage
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.plugins.stage import Result
 
     Datasets = tuple[Dataset, ...]
 
@@ -33,7 +32,6 @@ class Params:
 @stage(version=12)
 def report(params: Params, results: Datasets) -> Result:
     """Return a page with the answer, charts, tables, and the source of every number."""
-    from tacpipe.plugins.stage import Result
     from tacpipe.report import page
 
     return Result(files={"report.html": page.render(results, title=params.title, traces=params.traces)})

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.streams import COUNT, columns_with_quantity, common_unit, count_axes
+from tacpipe.channels.streams import COUNT, columns_with_quantity, common_unit, count_axes, finger_stream, remove_spikes
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import (
     Fraction,
@@ -112,7 +112,6 @@ class Params(StreamSelection):
 def slides(params: Params, recording: Recording) -> RecordingOutput:
     """Return the slide of a recording, with its metrics as attributes."""
     from tacpipe.channels import arm
-    from tacpipe.channels.streams import finger_stream, remove_spikes
     from tacpipe.datasets.overview import columns_of, streams_of
     from tacpipe.signals import slides as slide_signals
 
@@ -166,7 +165,6 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     import pyarrow as pa
 
     from tacpipe.channels import arm
-    from tacpipe.channels.streams import finger_stream, remove_spikes
     from tacpipe.io.columns import release
     from tacpipe.signals import slides as slide_signals
     from tacpipe.signals.contact import OFF_FRACTION, Thresholds, load_in_blocks, measure_rest, noise_thresholds

@@ -5,19 +5,17 @@ Example: tacpipe split data/segments -o data/split --calibration 0.15
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import RecordingOutput, Result, stage
+from tacpipe.plugins.stage import RecordingOutput, Result, Roles, stage
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.plugins.stage import Roles
 
 SHOWN = 5  # maximum number of folds listed in a note; further ones are counted
 

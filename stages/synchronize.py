@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from tacpipe.channels import streams as masks
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
@@ -91,7 +92,6 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     import pyarrow as pa
 
     from tacpipe.arrays import to_arrow
-    from tacpipe.channels import streams as masks
     from tacpipe.io.spill import MappedArrays
     from tacpipe.signals.repairs import mean_rate_hz, new_frame_rate_hz
     from tacpipe.signals.resampling import default_gap_ns, median_step_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import reprlib
 import unicodedata
@@ -55,8 +56,6 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     >>> suggestion("materail", ["sensor", "material"]), suggestion("xyz", ["sensor"])
     (' Did you mean material?', '')
     """
-    import difflib
-
     similar = difflib.get_close_matches(name, list(names), n=1, cutoff=0.7)
     return f" Did you mean {plain(similar[0])}?" if similar else ""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -120,8 +121,6 @@ def add(program: typer.Typer, help_text: str) -> None:
 
 def _dry_run(commands: Any, rig: Rig, *, as_json: bool) -> str:
     """Measure every stream of a rig and return the figures as lines or as one JSON object."""
-    from dataclasses import asdict
-
     from tacpipe.recording.recorder import complete_rig
     from tacpipe.recording.watch import describe_figures
 
@@ -146,8 +145,6 @@ def _report(
     failed: TacpipeError | None = None,
 ) -> None:
     """Print the dataset's path or, for JSON, one object with the recordings and the error ``failed``, if there is one."""
-    from dataclasses import asdict
-
     if as_json:
         seconds = round(time.monotonic() - began_s, 3)
         described = [asdict(recording) for recording in recorded]

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import tacpipe
 from tacpipe.datasets import replacing
 from tacpipe.datasets.overview import describe_streams
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
+from tacpipe.io.files import readable_errors, write_whole
 
 if TYPE_CHECKING:
     from tacpipe.clouds.candidates import Candidate
@@ -129,7 +131,6 @@ def _name_excerpt(names: list[str]) -> str:
 
 def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
     """Return the grasp predictor of the model at ``path``. Raises `UsageError` if its task has none."""
-    import tacpipe
     from tacpipe.datasets import model_files
     from tacpipe.plugins import registry
 
@@ -188,8 +189,6 @@ def _require_names(output: Path | None, picture: Path | None) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from tacpipe.io.files import readable_errors, write_whole
-
     with readable_errors(path.parent):
         write_whole(str(path), text.encode(), f"{path}.draft")
 

@@ -8,10 +8,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 from tacpipe import printable
 from tacpipe.comparison import engine
+from tacpipe.comparison.engine import Comparison
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
@@ -19,10 +21,6 @@ from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Attribute
 from tacpipe.store.location import locate
-
-if TYPE_CHECKING:
-    from tacpipe.comparison.engine import Comparison
-    from tacpipe.datasets.dataset import Dataset
 
 METRICS = "metrics.json"
 _LISTED = 3  # maximum number of values listed in a cell

@@ -13,6 +13,7 @@ import typer
 from tacpipe.datasets import replacing
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
+from tacpipe.io.files import readable_errors, write_whole
 
 if TYPE_CHECKING:
     from tacpipe.metrics.intervals import Estimate
@@ -95,8 +96,6 @@ def format_limits(measured: Limits) -> str:
 
 
 def _write(path: Path, content: str) -> None:
-    from tacpipe.io.files import readable_errors, write_whole
-
     with readable_errors(path.parent):
         write_whole(str(path), content.encode(), f"{path}.draft")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -210,8 +211,6 @@ def _report(
 
     Raises `DeviceError`, or exits with its code for JSON, if streams were lost.
     """
-    from dataclasses import asdict
-
     failed = DeviceError("\n".join(["What came is kept, but streams were lost on the way.", *lost])) if lost else None
     if as_json:
         value = {

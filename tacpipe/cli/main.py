@@ -12,16 +12,16 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import typer
 
 from tacpipe.cli import help
+from tacpipe.cli import help as plain_help
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.io import memory, terminal, termination
 from tacpipe.io.files import describe
 from tacpipe.plugins import extras
-
-if TYPE_CHECKING:
-    import typer
 
 COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # set by the shell: complete_bash, complete_zsh, complete_fish or source_...
 
@@ -66,8 +66,6 @@ def app(arguments: Sequence[str]) -> typer.Typer:
 
     ``--version`` prints the versions and exits.
     """
-    import typer
-
     from tacpipe.cli import commands
     from tacpipe.plugins import registry
 
@@ -173,10 +171,6 @@ def _complain(sentence: str) -> None:
 
 def _call(arguments: Sequence[str]) -> tuple[int, str]:
     """Run a command line and return its exit code, and a message if it is malformed, else ""."""
-    import typer
-
-    from tacpipe.cli import help as plain_help
-
     words = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
     program = app(words if (completed_words := words_to_complete()) is None else completed_words)
     help.refuse_addresses(program)
@@ -196,8 +190,6 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
 
 def _misuse() -> type[Any]:
     """Return the exception type that click raises for a malformed command line; typer may bundle its own click."""
-    import typer
-
     return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 

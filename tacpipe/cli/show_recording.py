@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
+import tacpipe
 from tacpipe.channels import streams
 from tacpipe.channels.streams import GAP, gap_shares
 from tacpipe.datasets.intervals import all_intervals
@@ -176,8 +177,6 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
 
 
 def _open(dataset: Path) -> Dataset:
-    import tacpipe
-
     return tacpipe.open(dataset)
 
 

@@ -15,17 +15,15 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from multiprocessing.connection import wait
+from multiprocessing.context import ForkServerContext
+from multiprocessing.context import ForkServerProcess as Process
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tacpipe.engine import provenance
 from tacpipe.engine.executors import local
 from tacpipe.io import termination
 from tacpipe.training import devices
-
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext
-    from multiprocessing.context import ForkServerProcess as Process
 
 Command = str | Sequence[str]  # shell command line, or arguments of a tacpipe command without ``tacpipe``
 OWN = (
@@ -115,8 +113,6 @@ class StageProcesses:
         return name, self._collect_stage(name)
 
     def _wait_for_stages(self, timeout_s: float | None) -> list[str]:
-        from multiprocessing.connection import wait
-
         ready = wait([process.sentinel for process in self._running.values()], timeout_s)
         return [name for name, process in self._running.items() if process.sentinel in ready]
 

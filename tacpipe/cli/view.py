@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import tempfile
+import time
+import webbrowser
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import tacpipe
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import terminal
 from tacpipe.plugins import extras
+from tacpipe.plugins.stage import Attribute
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.plugins.stage import Attribute
     from tacpipe.viewer.contents import DrawnContents
 
 EXAMPLE = (
@@ -129,8 +132,6 @@ def _select_recordings(
     path: Path, names: Sequence[str], label_texts: Sequence[str], split: Path | None, role: str | None, fold: int
 ) -> Dataset:
     """Return the recordings that the options select. Raises `UsageError` if the dataset has none."""
-    import tacpipe
-
     required_labels = conditions(label_texts)
     opened = tacpipe.open(path)
     if not len(opened):
@@ -167,8 +168,6 @@ def _collect_contents(
 
 
 def _opened(path: Path | None) -> Dataset | None:
-    import tacpipe
-
     return None if path is None else tacpipe.open(path)
 
 
@@ -219,9 +218,6 @@ def _show_in_window(files: Sequence[Path]) -> None:
 
 def _show_in_browser(files: Sequence[Path], port: int | None) -> None:
     """Serve the files to a browser on this computer, and open it, until Ctrl-C. Raises the errors of `serve`."""
-    import time
-    import webbrowser
-
     from tacpipe.viewer.session import serve
 
     with serve(files, port) as address:

@@ -16,13 +16,13 @@ from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import SOME_ROWS
+from tacpipe.plugins.stage import Fitted
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
-    from tacpipe.plugins.stage import Fitted
 
 
 LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes the position of a channel

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 
 import numpy as np
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import Scalar
 from tacpipe.metrics import pairing
+from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    from tacpipe.arrays import AnyFloats
     from tacpipe.comparison.engine import Comparison, ComparisonRow
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.metrics.pairing import Measure, Sums
     from tacpipe.report.blocks import Cell, Fold
     from tacpipe.report.context import Context
 

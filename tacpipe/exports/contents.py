@@ -14,6 +14,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
+import numpy as np
+
 from tacpipe.channels import schema, streams
 from tacpipe.printable import plain
 
@@ -94,7 +96,6 @@ def part(
     ``losses`` are known losses of the format, ``carried`` the columns that it contains (None for all). A column that is in
     neither becomes a loss.
     """
-    import numpy as np
     import pyarrow as pa
 
     columns, rows = [], []

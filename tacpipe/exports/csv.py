@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Contents, ExportStream, Loss, stream_label
 from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, readme_text
@@ -155,7 +157,6 @@ def _writable_column(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def _losses(stream: str, table: Columns) -> Iterator[Loss]:
     """Yield what CSV and the layout cannot represent of a stream."""
-    import numpy as np
     import pyarrow as pa
     import pyarrow.compute as pc
 

@@ -268,8 +268,6 @@ class FrameArray:
 
     def type_in(self, columns: Columns) -> ArrayType:
         """Return the type of a recording's values: float32 for actions, otherwise the widest type of the columns."""
-        import numpy as np
-
         return np.dtype(np.float32) if self.actions else common_type(columns, self.channels)
 
     def shape(self, rows: int) -> tuple[int, ...]:

@@ -15,24 +15,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
+import numpy as np
+
+from tacpipe.arrays import AnyArray
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss, stream_label
 from tacpipe.exports.files import Files, Scratch, copy_to_sink
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
+from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, Roles, stage
 from tacpipe.printable import listed
 
 if TYPE_CHECKING:
     import h5py
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.exports.frames import FrameArray
     from tacpipe.io.columns import Columns
-    from tacpipe.plugins.stage import Roles
 
     Parts = Dataset
 
@@ -198,7 +199,6 @@ def _write_attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Ite
 def _write_column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[Loss]:
     """Write a column; yield its losses."""
     import h5py
-    import numpy as np
     import pyarrow as pa
 
     kind = field.type
@@ -263,8 +263,6 @@ def _write_array(demo: h5py.Group, array: FrameArray, columns: Columns) -> h5py.
 
 def _chunks(blocks: Iterable[AnyArray]) -> Iterator[tuple[int, AnyArray]]:
     """Yield the rows of blocks in whole chunks, each with the index of its first row, so that it is compressed once."""
-    import numpy as np
-
     buffered: list[AnyArray] = []
     first_row = count = 0
     for block in blocks:

@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
+import numpy as np
+
 from tacpipe.channels.streams import GRID
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents
@@ -311,7 +313,6 @@ def _index_columns(first: int, rows: int, episode: int, start: int, task: int, f
 
     ``start`` is the index of the episode's first frame in the dataset.
     """
-    import numpy as np
     import pyarrow as pa
 
     frame = np.arange(first, first + rows)

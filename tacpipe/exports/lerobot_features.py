@@ -6,6 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
+from tacpipe.arrays import ArrayType, Floats
 from tacpipe.exports.contents import TIME
 from tacpipe.plugins.constraints import Names, Rate
 from tacpipe.plugins.params import added
@@ -13,7 +16,6 @@ from tacpipe.plugins.params import added
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import ArrayType, Floats
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.exports.files import Scratch
     from tacpipe.exports.frames import Channel
@@ -75,7 +77,6 @@ class FrameFeature:
 
         Text stays in memory.
         """
-        import numpy as np
         import pyarrow as pa
 
         from tacpipe.exports import frames
@@ -99,8 +100,6 @@ class FrameFeature:
 
 def features_of_frames(params: Params, columns: Columns) -> list[FrameFeature]:
     """Return the features of a synchronized recording: state, action, tactile, other signals, then the original columns."""
-    import numpy as np
-
     from tacpipe.exports import frames
 
     channels = frames.channels(columns)
@@ -149,8 +148,6 @@ Stats = dict[str, dict[str, list[Any]]]  # feature -> statistic -> value of each
 
 def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield each column of a feature with its statistics, zeros if nothing was measured; nothing for text."""
-    import numpy as np
-
     if feature.dtype == "string":
         return
     for channel in feature.channels:
@@ -163,8 +160,6 @@ def column_statistics(feature: FrameFeature, columns: Columns) -> Iterator[tuple
 
 def _compute_statistics(values: Floats) -> tuple[float, ...]:
     """Return minimum, maximum, mean, standard deviation and quantiles of the finite values; zeros if there are none."""
-    import numpy as np
-
     finite = values[np.isfinite(values)]
     if not len(finite):
         return (0.0,) * len(STATISTICS)
@@ -188,8 +183,6 @@ def episode_statistics(features: Sequence[FrameFeature], part: Recording, rows: 
 
 def index_statistics(rows: int, episode: int, start: int, task: int, fps: float) -> Stats:
     """Return the statistics of the index columns of frames, episodes and tasks."""
-    import numpy as np
-
     frame = np.arange(rows, dtype=np.float64)
     columns = {
         "timestamp": frame / fps,
@@ -219,8 +212,6 @@ def dataset_statistics(
 
     ``tasks`` is the index of each recording's task.
     """
-    import numpy as np
-
     episodes = [
         {
             **episode_statistics(features, parts[name], rows),

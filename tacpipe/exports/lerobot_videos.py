@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 import numpy as np
 
+from tacpipe.arrays import Bytes, Floats, Int64s
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
 from tacpipe.video.stream import (
@@ -32,7 +33,6 @@ from tacpipe.video.stream import (
 )
 
 if TYPE_CHECKING:
-    from tacpipe.arrays import Bytes, Floats, Int64s
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
 

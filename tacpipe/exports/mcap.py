@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss
 from tacpipe.exports.files import Files
@@ -107,8 +109,6 @@ def _write_mcap(recording: Recording, name: str, streams: Sequence[_Stream], sin
 
 def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterator[_Stream]:
     """Yield the streams that become topics, and add to ``losses`` what the messages cannot represent."""
-    import numpy as np
-
     from tacpipe.exports import ros
     from tacpipe.exports.pictures import Pictures
     from tacpipe.video.stream import read_format
@@ -219,8 +219,6 @@ def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
 
 def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
     """Yield log time, channel and content of the messages of the topic with this index."""
-    import numpy as np
-
     from tacpipe.exports import ros
 
     for topics in blocks:

@@ -15,6 +15,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from tacpipe.arrays import AnyArray, ArrayType
 from tacpipe.exports import contents
 from tacpipe.exports.contents import Loss
 from tacpipe.exports.files import README_NAME, Content, Files, Scratch, loss_notes, readme_text
@@ -26,7 +29,6 @@ from tacpipe.plugins.stage import RecordingOutput, Result, stage
 if TYPE_CHECKING:
     from zarr.abc.buffer import Buffer
 
-    from tacpipe.arrays import AnyArray, ArrayType
     from tacpipe.datasets.dataset import Dataset, Recording
 
     Parts = Dataset
@@ -86,8 +88,6 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
 
     Example: tacpipe export zarr data/recordings -o exports/zarr --rate-hz 50 --actions robot
     """
-    import numpy as np
-
     from tacpipe.exports import frames
 
     all_recordings = list(recordings)
@@ -190,8 +190,6 @@ class _ArrayWriter:
 
     def append(self, values: AnyArray) -> None:
         """Add rows, and write complete chunks."""
-        import numpy as np
-
         self._waiting.append(values)
         self._rows += len(values)
         complete_rows = self._rows // self._chunk_rows * self._chunk_rows
@@ -202,8 +200,6 @@ class _ArrayWriter:
 
     def files(self) -> dict[str, Content]:
         """Write the last rows and return the files of the array by name."""
-        import numpy as np
-
         if self._rows:
             self._write(np.concatenate(self._waiting))
         self._scratch.check()

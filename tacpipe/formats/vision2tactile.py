@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import published
 from tacpipe.formats.published import by_object, require
 from tacpipe.io import regular
 from tacpipe.io.hashing import remembered_file_digest
@@ -68,7 +69,6 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.channels import biotac_sp, schema
     from tacpipe.clouds import point_files
     from tacpipe.clouds.files import require_metres
-    from tacpipe.formats import published
 
     grasp_files = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
     label, time_s, _ = next(name for name in files if not name.startswith(TWIN)).split("/")

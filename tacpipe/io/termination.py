@@ -16,6 +16,7 @@ import os
 import select
 import signal
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -254,8 +255,6 @@ def _terminal_restorer() -> Callable[[], None]:
     """Return a function that restores the terminal's present state, which a killed process cannot do."""
     settings: list[tuple[int, Any]] = []
     with contextlib.suppress(ImportError, OSError):
-        import termios
-
         settings = [(0, termios.tcgetattr(0))] if os.isatty(0) else []
     show_cursor = b"\r\x1b[2K\x1b[?25h" if os.isatty(2) and os.environ.get("TERM", "dumb") != "dumb" else b""
 

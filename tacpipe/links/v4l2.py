@@ -18,11 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io import files
 from tacpipe.links import ports
 from tacpipe.links.link import Arrived, DescriptorLink
 from tacpipe.links.ports import Port
+from tacpipe.plugins import extras
 from tacpipe.sensors.camera import COUNTS, Frame, pack_frame, pack_settings
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.video.encoding import ENCODED_BY, JPEG_QUALITY, JpegEncoder
@@ -340,11 +343,8 @@ class V4l2Link(DescriptorLink):
 
     def _encode(self, content: bytes) -> bytes:
         """Return raw pixels as JPEG; an incomplete frame unchanged."""
-        from tacpipe.plugins import extras
-
         with extras.explain_missing(ENCODED_BY):
             import av
-        import numpy as np
 
         size_px = self.capture.height_px, self.capture.width_px
         if len(content) < 2 * size_px[0] * size_px[1] or self._encoder is None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.live.stages import RecordingInMemory, stage_params
+from tacpipe.plugins import registry
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
 from tacpipe.video.stream import read_format
 
@@ -44,8 +45,6 @@ def extracted_streams(
 
     Without such a stage or a camera, the streams are unchanged.
     """
-    from tacpipe.plugins import registry
-
     step = next((step for step in steps if step["stage"] in CHANNELS), None)
     if step is None or all(read_format(table) is None for table in tables.values()):
         return dict(tables)

@@ -20,10 +20,10 @@ from tacpipe.printable import plain
 from tacpipe.recording import recorder
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, RigStream
+from tacpipe.sensors.sensor import Options
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.sensors.sensor import Options
 
 CONFIG = "config.json"
 PATHS = ("model",)

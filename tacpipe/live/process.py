@@ -25,6 +25,7 @@ from tacpipe.live.messages import Message
 from tacpipe.live.publishing import Publishers
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
+from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 
 REPORT_NS = 250_000_000  # period of reports to the recording process
@@ -173,7 +174,6 @@ def send_line(connection: socket.socket, content: wire.ModelLine) -> None:
 def open_engine(options: SessionOptions) -> Engine:
     """Return the engine of a session. Raises `UsageError` if model, rig and settings do not match."""
     from tacpipe.live.preparation import open_model
-    from tacpipe.recording import rig as rigs
 
     model = open_model(options.settings.model)
     rig = rigs.parse(options.rig)

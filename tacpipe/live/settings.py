@@ -22,11 +22,11 @@ from tacpipe.errors import UsageError
 from tacpipe.io import Json, Scalar
 from tacpipe.plugins import fields, params, registry
 from tacpipe.plugins.constraints import Range
+from tacpipe.plugins.stage import Attribute, Result
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.engine import Engine
-    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Options, Sensor

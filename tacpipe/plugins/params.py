@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args, get_origin
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.plugins import architectures
+from tacpipe.plugins import architectures, registry
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.constraints import StoredAs
 from tacpipe.plugins.fields import build_dataclass as build_dataclass
@@ -183,8 +183,6 @@ def kind_of(stage: AnyStage, values: StoredParams) -> Kind | None:
 
 def with_current_names(stage: str, values: StoredParams) -> StoredParams:
     """Return stored params with current names and choices, or unchanged if ``stage`` is not installed."""
-    from tacpipe.plugins import registry
-
     try:
         alternatives = kinds(registry.load(stage))
     except TacpipeError:

@@ -17,6 +17,7 @@ from tacpipe.io.termination import EndRequest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, sealing, spool_folders, triggers
+from tacpipe.recording import rig as rig_of
 from tacpipe.recording.appending import NothingError
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
@@ -135,8 +136,6 @@ def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     ``opened`` is the output of this command, or None. Raises `TacpipeError`, and leaves the spool unchanged, if it belongs
     to another user, has an invalid header, or was recorded for a dataset elsewhere.
     """
-    from tacpipe.recording import rig as rig_of
-
     spooled = Spooled(folder, own_user_ids(folder.parent, [folder.lstat().st_uid]))
     rig_text = spooled.header.get("rig")
     if not isinstance(rig_text, str):

@@ -8,6 +8,8 @@ import os
 import re
 import select
 import sys
+import termios
+import tty
 from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
@@ -47,9 +49,6 @@ def watch_keys() -> Iterator[Keys]:
     settings = None
     typed, closed = b"", source < 0
     with contextlib.suppress(Exception):  # without a terminal, each line of standard input counts as a key
-        import termios
-        import tty
-
         settings = termios.tcgetattr(source)
         tty.setcbreak(source)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
+from tacpipe.datasets.manifest import ManifestJson
 from tacpipe.datasets.selection import PUBLISHED, is_simulated
 from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics.calibration import COVERAGE_FILE
@@ -20,17 +21,14 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.report import charts
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, fold, notes, table
-from tacpipe.report.charts import Curve
+from tacpipe.report.charts import Curve, Spec
+from tacpipe.store.records import Step
 from tacpipe.training.following import Line, read_history
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.datasets.manifest import ManifestJson
-    from tacpipe.report.charts import Spec
-    from tacpipe.store.records import Step
     from tacpipe.tasks.task import ModelConfig
 
 

@@ -8,16 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.selection import chain_difference
 from tacpipe.errors import UsageError
 from tacpipe.store.records import Step
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-    from tacpipe.store.records import Step
 
 
 @dataclass(frozen=True)

@@ -13,21 +13,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypedDict, TypeVar
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Scalar
+from tacpipe.plugins.stage import AnyStage, Requirements, Result
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tacpipe.arrays import AnyFloats
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
     from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
-    from tacpipe.plugins.stage import AnyStage, Requirements, Result
     from tacpipe.tasks.recordings import OpenedChain
 
 Files = Mapping[str, bytes]  # model files by name

@@ -11,14 +11,13 @@ import numpy as np
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.channels.schema import field_metadata
+from tacpipe.plugins.stage import Attribute
 from tacpipe.signals.resampling import linear
 from tacpipe.traces.curves import TIME, matrix
 from tacpipe.traces.taxels import Taxels
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.plugins.stage import Attribute
 
 
 @dataclass(frozen=True)

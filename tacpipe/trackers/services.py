@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io import Scalar
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
-
-    from tacpipe.io import Scalar
 
 
 MLFLOW_DATABASE = "sqlite:///mlflow.db"  # MLflow rejects its file store

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from tacpipe.arrays import AnyFloats, Bytes, Float32s
 from tacpipe.errors import TacpipeError
 from tacpipe.video.decoding import GREY, cell_means, open_decoder, padded_packet
 from tacpipe.video.encoding import RGB
@@ -18,7 +19,6 @@ from tacpipe.video.stream import PACKET, VideoFormat
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyFloats, Bytes, Float32s
     from tacpipe.video.markers import MarkerTracker
 
 COLOURS = ("red", "green", "blue")

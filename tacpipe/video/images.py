@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tacpipe.arrays import AnyArray, ArrayType, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import plain
 from tacpipe.video.encoding import MICROSECOND
@@ -20,8 +21,6 @@ from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, MAX_SIDE_PX, PACKET
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.arrays import AnyArray, ArrayType, Int64s
 
 START, END = b"\xff\xd8", b"\xff\xd9"  # first and last bytes of a JPEG image
 END_BYTES = 4096  # maximum number of bytes with which a camera pads an image

@@ -17,7 +17,7 @@ from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.intervals import all_intervals
 from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
-from tacpipe.plugins.stage import ParamValue
+from tacpipe.plugins.stage import Attribute, ParamValue
 from tacpipe.printable import plain
 from tacpipe.signals import contact
 from tacpipe.traces import curves, spans, taxels
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
-    from tacpipe.plugins.stage import Attribute
     from tacpipe.store.records import Step
 
 # quantities by priority

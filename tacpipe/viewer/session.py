@@ -46,8 +46,6 @@ def write(
     """
     import rerun as rr
 
-    from tacpipe.viewer import stream
-
     names_by_layout: dict[str, str] = {}
     paths = []
     for contents in recordings:

@@ -9,6 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tacpipe.errors import TacpipeError, is_input_error
+from tacpipe.formats.container import (
+    KINDS,
+    Share,
+    Sharing,
+    container_files,
+    describe_unread,
+    find_containers,
+    open_container,
+)
 from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
 from tacpipe.plugins.constraints import TomlFile
@@ -16,7 +25,6 @@ from tacpipe.plugins.stage import Files, P, R, RecordingOutput, Shared, Source, 
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
-    from tacpipe.formats.container import Share
     from tacpipe.formats.table import recordings
 
 EPISODE = "recording"  # key of a source's values for the recording's name in its files
@@ -152,8 +160,6 @@ class _ContainerShares:
 
     def _share(self, path: Path, names: Sequence[str], episode: str | None) -> Share | None:
         """Return the files that streams of a container are read from, or None for all of its files."""
-        from tacpipe.formats.container import Sharing, open_container
-
         streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
         if kind in layouts.CAMERA:
@@ -177,7 +183,6 @@ def preview_text(
     kind: layouts.Format | None = None,
 ) -> str:
     """Return a description of what would be read from a source, and what would not."""
-    from tacpipe.formats.container import describe_unread
     from tacpipe.formats.table import preview
 
     paths = [path for recording in listed_sources for path in member_files(recording.files).values()]
@@ -190,8 +195,6 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
 
     The reason is "" for label files and for files in a container.
     """
-    from tacpipe.formats.container import KINDS, find_containers
-
     formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(KINDS)
     folders = [path for name in formats for path in find_containers(name, source) if path.is_dir()]
 
@@ -227,8 +230,6 @@ def read_recording(
 
 def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
     """Return all files of a recording by name; the files of a folder are named ``name/relative path``."""
-    from tacpipe.formats.container import container_files
-
     return {
         f"{name}/{inner_path}" if inner_path else name: path
         for name, path in paths.items()

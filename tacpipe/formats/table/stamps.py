@@ -21,8 +21,6 @@ from tacpipe.printable import excerpt
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Bools, Int64s
-
 _DIRECTIVES = {
     "Y": r"\d{4}",
     "y": r"\d{2}",
@@ -86,7 +84,6 @@ def parse_stamps(column: pa.Array, time_format: str) -> tuple[Int64s, Bools]:
     >>> parse_stamps(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
     (array([2678401500000000,                0,                0]), array([ True, False, False]))
     """
-    import numpy as np
     import pyarrow.compute as pc
 
     groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(time_format))  # by directive letter

@@ -28,9 +28,9 @@ from tacpipe.sensors.sensor import Sensor
 from tacpipe.simulation import faults as clocks
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.byte_faults import ClockSteps, Faults, no_steps
-from tacpipe.simulation.emulation.endpoint import Endpoint, Peer
+from tacpipe.simulation.emulation.endpoint import Endpoint, Folder, Peer
 from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.source import Sampled, SampleSource, Timing
+from tacpipe.simulation.emulation.source import CloudSource, Sampled, SampleSource, SlideSource, Timing
 from tacpipe.simulation.emulation.transmission import FramePace, Transmission, TransmissionPlan
 from tacpipe.simulation.emulation.world import World
 
@@ -64,8 +64,6 @@ def endpoint(stream: RigStream, folder: Path) -> Endpoint:
             return VirtualCan(stream.sensor, stream.address.target.removeprefix("virtual:"))
         return Slcan(stream.sensor, _device(folder, stream.name))
     if scheme == "folder":
-        from tacpipe.simulation.emulation.endpoint import Folder
-
         return Folder(stream.sensor, folder / "files" / stream.name)
     if scheme in ("mjpeg", "v4l2"):
         from tacpipe.simulation.emulation.http_camera import HttpCamera
@@ -215,8 +213,6 @@ class Emulator:
         )
         timing = Timing(rate_hz, start_ns, clock(stream_pace, seed), steps, self.faults.wrap_s)
         if stream_pace.slides:
-            from tacpipe.simulation.emulation.source import SlideSource
-
             return SlideSource(sensor, timing, self.seed)
         last = name[-1] if name[-1] in "12" else "1"
         finger = (stream_pace.finger or int(last)) - 1
@@ -226,8 +222,6 @@ class Emulator:
             camera = complete_camera(sensor, stream_pace.video)
             return CameraSource(camera, self.world, timing, seed, finger, stream_pace.video)
         if has_points(sensor):
-            from tacpipe.simulation.emulation.source import CloudSource
-
             return CloudSource(sensor, timing, seed)
         return SampleSource(sensor, self.world, timing, seed, finger)
 

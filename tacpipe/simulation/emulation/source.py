@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bytes, Counts, Float32s, Floats, Int64s, Ints, Times
+from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.sensors.biotac import BioTac
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -184,8 +185,6 @@ def _group_by_quantity(fields: Sequence[pa.Field]) -> list[list[int]]:
 
 
 def _is_uskin(fields: Sequence[pa.Field]) -> bool:
-    from tacpipe.channels import schema
-
     return [channel.name for channel in fields] == [channel.name for channel in schema.uskin_fields()]
 
 

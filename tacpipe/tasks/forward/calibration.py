@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.metrics.calibration import check_levels, highest_promised_level
@@ -18,10 +19,7 @@ from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.quantiles import FILE, ForecastQuantiles, WindowErrors, fewer
 from tacpipe.tasks.forward.training import check_codec
 from tacpipe.tasks.recordings import add_calibration, trained_on_datasets
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.task import CalibrationRequest
+from tacpipe.tasks.task import CalibrationRequest
 
 FITTED = 5000  # number of windows for fitting quantiles, evenly spread over training recordings
 CORRECTED = 400  # number of windows per calibration recording

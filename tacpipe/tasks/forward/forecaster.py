@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from tacpipe.channels.arm import DEFAULT_POSE, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forecasts import Shrunk
 from tacpipe.models.linear import FittedBaselines
@@ -25,18 +26,13 @@ from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
 from tacpipe.tasks.forward import networks, tracks
-from tacpipe.tasks.forward.networks import with_actions
+from tacpipe.tasks.forward.networks import Network, with_actions
 from tacpipe.tasks.forward.params import ForwardConfig, Params
 from tacpipe.tasks.forward.quantiles import FILE as QUANTILES
 from tacpipe.tasks.forward.quantiles import ForecastQuantiles, window_features
+from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.recordings import OpenedChain
 from tacpipe.tasks.task import quantiles_of
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.tasks.forward.networks import Network
-    from tacpipe.tasks.forward.tracks import Track
-
 
 TASK = "forward"
 FAR = 0.95  # quantile over channels of the levels in a training row, whose maximum over rows is stored
@@ -142,8 +138,6 @@ class Forecaster:
     @cached_property
     def single(self) -> Network:
         """The network for a single window, as used by live sessions and `tacpipe predict --causal`."""
-        from tacpipe.tasks.forward.networks import Network
-
         return Network(self)
 
     def prepare_single(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Float32s, Times
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import one_after_another
 from tacpipe.io.spill import Gathered, Spill
@@ -24,8 +25,6 @@ from tacpipe.tasks.recordings import open_for_model
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
 
 
 def predict(

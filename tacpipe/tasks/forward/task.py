@@ -6,17 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.forward.params import REQUIREMENTS, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
-    from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.forward.prediction import ForwardModel
     from tacpipe.tasks.recordings import OpenedChain
 
@@ -36,7 +33,6 @@ class ForwardTask(Task):
 
         Example: tacpipe train forward data/segments --split data/split -o models/forward
         """
-        from tacpipe.plugins.stage import Result
         from tacpipe.tasks.forward import training
 
         files = training.train(params, train, val, workspace, init.files if init else None)

@@ -19,18 +19,16 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
+from tacpipe.io.columns import Columns
 from tacpipe.io.spill import MappedArrays
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
 from tacpipe.signals.runs import run_starts, window_starts
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.io.columns import Columns
 
 BLOCK_ROWS = 1 << 14  # rows per block
 IN_MEMORY = 1 << 27  # maximum bytes of recording rows in memory, above which they are stored on disk

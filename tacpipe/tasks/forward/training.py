@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from tacpipe.channels.arm import DEFAULT_POSE, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.io.spill import MappedArrays
@@ -54,10 +54,6 @@ from tacpipe.tasks.forward.tracks import BLOCK_ROWS, Track
 from tacpipe.tasks.recordings import add_earlier, trained_on_datasets
 from tacpipe.training import devices, loop, scaling
 from tacpipe.training.following import history_bytes
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # evenly spaced windows for fitting scales; they overlap, so almost all rows are used

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Float32s
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
 from tacpipe.metrics.headline import MIN_CLUSTERS
 from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.tasks.material.classifier import CONFIG, UNKNOWN_ANSWER, Classifier
+from tacpipe.tasks.material.headline import MaterialMetrics, ProbabilityMeasures, StatedProbabilities, UnknownMeasures
+from tacpipe.tasks.material.params import UnknownDescription
 from tacpipe.tasks.material.sensor_calibration import (
     CALIBRATION_FILE,
     SensorCalibration,
@@ -24,21 +27,8 @@ from tacpipe.tasks.material.sensor_calibration import (
     fit_calibration,
     pack_calibrations,
 )
-from tacpipe.tasks.material.slides import Slides
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.material.headline import (
-        MaterialMetrics,
-        ProbabilityMeasures,
-        StatedProbabilities,
-        UnknownMeasures,
-    )
-    from tacpipe.tasks.material.params import UnknownDescription
-    from tacpipe.tasks.material.slides import BySensor, Slides
-    from tacpipe.tasks.task import CalibrationRequest
+from tacpipe.tasks.material.slides import BySensor, Slides
+from tacpipe.tasks.task import CalibrationRequest
 
 
 def calibrate(

@@ -6,13 +6,14 @@ import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Int64s
 from tacpipe.datasets import model_files, selection
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.metrics import headline
@@ -26,9 +27,6 @@ from tacpipe.tasks.material.headline import ChanceAccuracy, MaterialScores, Sens
 from tacpipe.tasks.material.network_training import HISTORY
 from tacpipe.tasks.material.params import MEAN_LEVEL
 from tacpipe.tasks.material.slides import Slides
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
 

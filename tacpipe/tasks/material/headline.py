@@ -17,13 +17,12 @@ from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
-from tacpipe.tasks.material.params import KEY
+from tacpipe.tasks.material.params import KEY, StoredNaming
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.metrics.calibration import ConfidenceBin
-    from tacpipe.tasks.material.params import StoredNaming
 
 TASK = "material"
 CHANCE = "chance"

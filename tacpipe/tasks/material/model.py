@@ -20,8 +20,6 @@ from tacpipe.tasks.recordings import open_for_model
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Dataset
-
 
 def predict(
     model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = (), *, probabilities: bool = False

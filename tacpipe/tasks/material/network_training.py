@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.readout import Level
@@ -52,9 +53,6 @@ from tacpipe.tasks.material.slides import BySensor, Slides
 from tacpipe.training import devices, loop
 from tacpipe.training.following import Line, history_bytes
 from tacpipe.training.scaling import Affine
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 HISTORY = "history.jsonl"
 

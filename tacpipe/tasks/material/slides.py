@@ -15,12 +15,12 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed
 from tacpipe.tasks.material.headline import NUMBERS, UNKNOWN, Naming
+from tacpipe.tasks.material.params import StoredLayout
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.tasks.material.params import StoredLayout
 
 STREAM = "slide"
 TACTILE = "tactile"

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, stage
+from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
 from tacpipe.tasks.material.params import KEY, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
-    from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.recordings import OpenedChain
 
@@ -102,7 +99,6 @@ class MaterialTask(Task):
 
         Example: tacpipe train material data/slides --split data/slides-split -o models/material
         """
-        from tacpipe.plugins.stage import Result
         from tacpipe.tasks.material import network_training
 
         return Result(files=network_training.train(params, train, val, workspace, init.files if init else None))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import combine_origins
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import headline, pairing
@@ -23,9 +24,6 @@ from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.scorers import CONSTANT, score_baselines
 from tacpipe.tasks.slip.training import TASK, labelled_tracks, score_windows, scored_tracks
 from tacpipe.tasks.slip.windows import STABLE, TrainingWindows, match_time, read_windows
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 MODEL = "model"
 WINDOWS, EVENTS = "windows", "events.json"

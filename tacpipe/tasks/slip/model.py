@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Floats, Indices
 from tacpipe.datasets import model_files
-from tacpipe.datasets.dataset import Recording
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
@@ -23,10 +23,7 @@ from tacpipe.tasks.slip.params import SlipConfig, SlipModelParams
 from tacpipe.tasks.slip.scorers import Scorer, load_baseline
 from tacpipe.tasks.slip.training import BASELINES, MODEL, labelled_tracks, score_windows, scored_tracks
 from tacpipe.tasks.slip.windows import Finger, FingerReader, GraspTrack, read_windows
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.task import CalibrationRequest, Files
+from tacpipe.tasks.task import CalibrationRequest, Files
 
 NEEDED: Mapping[str, model_files.Kind] = {
     "fingers": list,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
 from tacpipe.errors import UsageError
@@ -21,8 +22,6 @@ from tacpipe.plugins.params import Panels, added
 from tacpipe.tasks.task import ModelConfig
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tacpipe.arrays import AnyArray
     from tacpipe.tasks.slip.scorers import Scorer
     from tacpipe.tasks.slip.training import SlipTraining
@@ -166,8 +165,6 @@ class ForecastRule(SlipModelParams):
 
 
 def _path(text: str) -> Path:
-    from pathlib import Path
-
     return Path(text)
 
 

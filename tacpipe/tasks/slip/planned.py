@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Times
-from tacpipe.live.plans import PlanHistory
+from tacpipe.live.plans import PlanHistory, PosePlan
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.slip.features import EPSILON, NAMES
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
     from tacpipe.live.decoding import BatchColumns
-    from tacpipe.live.plans import PosePlan
 
 STEP_NS, POINTS = 20_000_000, 50  # times after a row at which a plan is sampled: one second
 SMALLEST_STEP_NS = 10_000_000  # time between two points of a plan below which the later one is left out

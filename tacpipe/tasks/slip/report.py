@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, TaskReport
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.report.blocks import NONE, Cell, Fold, fixed, fold, notes, table
 from tacpipe.tasks.slip.evaluation import EVENTS, MODEL, WINDOWS, EvaluatedSlips, brier_measure
 from tacpipe.tasks.slip.metrics import PARTS, ObjectEstimate
 
 if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
     from tacpipe.report.context import Context
 
 ALARM_HEADS = {

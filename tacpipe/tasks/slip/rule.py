@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import tacpipe
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
 from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -73,15 +75,12 @@ class RuleScorer:
     @cached_property
     def _forward_model(self) -> Model:
         """The model, opened once for all tracks."""
-        import tacpipe
-
         return tacpipe.open(Path(self.path))
 
     def forecasts(self, recording: Recording) -> pa.Table:
         """Return the forecasts of a recording, with the metadata of their columns, which `ForwardModel.predict` lacks."""
         import pyarrow as pa
 
-        from tacpipe.datasets import model_files
         from tacpipe.tasks.recordings import OpenedChain, open_for_model
         from tacpipe.tasks.task import PredictionRequest
 

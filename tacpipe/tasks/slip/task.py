@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, stage
+from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
 from tacpipe.tasks.slip.params import Params
 from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
 
@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
-    from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.slip.model import SlipModel
 
@@ -72,7 +71,6 @@ class SlipTask(Task):
 
         Example: tacpipe train slip data/slips --split data/split -o models/slip
         """
-        from tacpipe.plugins.stage import Result
         from tacpipe.tasks.slip import training
 
         return Result(files=training.train(params, train, val, workspace))

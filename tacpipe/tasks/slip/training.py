@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors.numpy import save
 
 from tacpipe.arrays import AnyArray, Floats
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks import recordings
@@ -26,9 +26,6 @@ from tacpipe.tasks.slip.windows import (
     read_windows,
     shuffle_labels,
 )
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 TASK = "slip"
 MODEL, BASELINES = "scorer.safetensors", "baselines.safetensors"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -381,8 +382,6 @@ def _tactile_tables(recording: Recording, streams: str) -> Iterator[tuple[str, p
 
     Raises `TacpipeError` if there is none.
     """
-    from fnmatch import fnmatchcase
-
     patterns = [word.strip() for word in streams.split(",") if word.strip()]
     has_any = False
     for stored_stream in recording.streams:

@@ -7,7 +7,7 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypedDict
+from typing import TypedDict
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +15,7 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import selection
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
 from tacpipe.metrics import headline, regression
@@ -34,9 +35,6 @@ from tacpipe.tasks.touch.headline import (
     TRUE,
 )
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
 Scores = dict[str, float | None]  # values by name; None if a measure is undefined

@@ -11,11 +11,13 @@ import pyarrow as pa
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics.calibration import check_levels
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks import recordings
 from tacpipe.tasks.recordings import open_for_model
+from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.evaluation import readings_table, simulated
 from tacpipe.tasks.touch.headline import PREDICTIONS
@@ -24,9 +26,6 @@ from tacpipe.tasks.touch.quantiles import FILE, ReadingQuantiles
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.tasks.task import CalibrationRequest
 
 
 def predict(

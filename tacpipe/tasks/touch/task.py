@@ -6,17 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, stage
+from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
 from tacpipe.tasks.task import Calibration, Demo, Files, GraspPredictor, PredictionRequest, Task
 from tacpipe.tasks.touch.params import Params
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
-    from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
@@ -103,7 +100,6 @@ class TouchTask(Task):
 
         Example: tacpipe train touch data/grasps --split data/grasps-split -o models/touch
         """
-        from tacpipe.plugins.stage import Result
         from tacpipe.tasks.touch import training
 
         return Result(files=training.train(params, train, val, workspace))

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from tacpipe.arrays import Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
@@ -32,10 +32,6 @@ from tacpipe.tasks.touch.params import MemberDescription, Params, PointNetwork, 
 from tacpipe.training import devices, loop
 from tacpipe.training.following import Line, NetworkLabels, history_bytes
 from tacpipe.training.scaling import Affine
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-
 
 LEAF_SIZES = (2, 4, 8)  # leaf sizes to try
 

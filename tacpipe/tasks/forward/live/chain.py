@@ -18,6 +18,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
+from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.extraction import live_channels
 from tacpipe.live.plans import PlanHistory
 from tacpipe.models.tensors import one_thread
@@ -25,6 +26,7 @@ from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.signals.resampling import GAP_NS
+from tacpipe.store.records import Step
 from tacpipe.synchronization.causal import Grid, GridRows
 from tacpipe.tasks.forward import causal, headline
 from tacpipe.tasks.forward.causal import Arm, Rolling
@@ -32,13 +34,10 @@ from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.inputs import InputLayout, plan_table
 from tacpipe.tasks.forward.live.plans import Targets, facing
 from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
+from tacpipe.video.channels import LiveChannels
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.live.decoding import BatchColumns
-    from tacpipe.store.records import Step
-    from tacpipe.video.channels import LiveChannels
 
 CODEC_GAP = 1.5  # periods between two rows above which a codec starts a new run, as `run_starts` does offline
 

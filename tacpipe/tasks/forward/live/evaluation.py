@@ -12,12 +12,13 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.extraction import extracted_streams
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
@@ -32,9 +33,6 @@ from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.tracks import Levels, Track
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 MODEL = "live_model"  # attribute of a recording: the digest of the model of its session

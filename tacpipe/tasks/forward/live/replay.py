@@ -8,21 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live.extraction import extracted_streams
 from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
+from tacpipe.store.records import Step
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, GridForecast, LiveChain
 from tacpipe.tasks.forward.prediction import check_steps, prediction_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Model, Recording
-    from tacpipe.store.records import Step
 
 PIECE_NS = 1_000_000_000  # duration of the chunks of a recording that a chain gets
 

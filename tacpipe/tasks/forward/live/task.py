@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import PositiveInt
+from tacpipe.plugins.stage import Attribute, Result
+from tacpipe.sensors.live import Declaration
 from tacpipe.sensors.plan import MEASURED
+from tacpipe.sensors.sensor import Options, Sensor
 from tacpipe.tasks.forward.live.messages import DECLARATION, FORECAST
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.engine import Engine
-    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
-    from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Options, Sensor
     from tacpipe.tasks.forward.params import ForwardConfig
     from tacpipe.tasks.task import PredictionRequest
 

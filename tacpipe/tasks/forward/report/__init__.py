@@ -23,8 +23,6 @@ from tacpipe.tasks.forward.report import events, figures, methods, representatio
 from tacpipe.tasks.forward.report.methods import ACTIONS, ComparedRun, Method, shown_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tacpipe.datasets.dataset import Dataset
 
 

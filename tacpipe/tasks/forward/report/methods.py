@@ -14,6 +14,7 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import PredictorErrors, Question, Settings
 from tacpipe.errors import TacpipeError
+from tacpipe.io.parquet import owned
 from tacpipe.report import context
 from tacpipe.report.context import drop_duplicates
 from tacpipe.tasks.forward import headline
@@ -23,7 +24,6 @@ from tacpipe.tasks.forward.params import PAPER, CodecDescription, ForwardConfig
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
 
 
@@ -74,8 +74,6 @@ def read_error_sums(content: bytes) -> ErrorSums:
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
-
-    from tacpipe.io.parquet import owned
 
     schema = pq.read_schema(pa.BufferReader(owned(content)))
     missing = [name for name in ERROR_COLUMNS if name not in schema.names]

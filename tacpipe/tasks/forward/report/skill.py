@@ -15,6 +15,7 @@ from tacpipe.comparison.runs import MODEL
 from tacpipe.metrics import calibration, intervals, pairing
 from tacpipe.metrics.calibration import COVERAGE_FILE, Band
 from tacpipe.metrics.intervals import Interval
+from tacpipe.metrics.pairing import Sums
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, SmallPrint, fold, interval, number, table
 from tacpipe.report.charts import Curve
@@ -27,9 +28,6 @@ from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from tacpipe.arrays import AnyFloats
-    from tacpipe.metrics.pairing import Sums
 
 
 def sums_of_row(row: ComparisonRow, steps: Sequence[int], known_objects: bool | None, group: str = "both") -> Sums:

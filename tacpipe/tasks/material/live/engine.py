@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe.channels.streams import finger_stream
 from tacpipe.io import Json
 from tacpipe.live.decoding import Decoder, likely_schema
 from tacpipe.live.engine import SETTLE_NS, Engine
@@ -246,8 +247,6 @@ class MaterialEngine(Engine):
 
 def find_finger(sensors: Mapping[str, Sensor]) -> str:
     """Return the stream with tactile channels. Raises `TacpipeError` if there is not exactly one."""
-    from tacpipe.channels.streams import finger_stream
-
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
     tables = {name: schema.empty_table() for name, schema in schemas.items()}
     finger_table = finger_stream("of this rig", tables)

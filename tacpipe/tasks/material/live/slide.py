@@ -15,11 +15,13 @@ import numpy as np
 
 from tacpipe.arrays import Float32s
 from tacpipe.channels.streams import EVENTS, finger_stream
+from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.live.stages import stage_params, streams_as_recorded
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Result
 from tacpipe.sensors.live import LATENCY
+from tacpipe.store.records import Step
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS
@@ -29,13 +31,8 @@ from tacpipe.tasks.material.slides import STREAM, describe_difference
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.plugins.stage import Attribute
-    from tacpipe.store.records import Step
-
     Tables = Mapping[str, pa.Table]
     import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 SLIDES = "segment.slides"
 ENDED_NS = 200_000_000  # time without a row of the slide after which it has ended

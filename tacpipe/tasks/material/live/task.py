@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
+from tacpipe.plugins.stage import Result
 from tacpipe.printable import listed
+from tacpipe.sensors.live import Declaration
+from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import DECLARATION, MATERIAL, MIN_SEEN, MaterialDescription
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.plugins.stage import Result
     from tacpipe.recording.rig import Rig
-    from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.material.classifier import Classifier
     from tacpipe.tasks.material.live.engine import MaterialEngine
     from tacpipe.tasks.task import PredictionRequest

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings, marks
 from tacpipe.report import context
@@ -29,7 +30,6 @@ from tacpipe.tasks.material.report.predictions import (
 )
 
 if TYPE_CHECKING:
-    from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
 
 

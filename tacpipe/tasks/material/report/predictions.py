@@ -13,11 +13,10 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.tasks.material.headline import NUMBERS, Naming
+from tacpipe.tasks.material.params import MaterialConfig
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from tacpipe.tasks.material.params import MaterialConfig
 
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"

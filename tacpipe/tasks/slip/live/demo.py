@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import tacpipe
 from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
@@ -93,8 +94,6 @@ def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
 
     Raises `TacpipeError` if the session began after the first trial.
     """
-    import tacpipe
-
     recordings = tacpipe.open(output / "live")
     recording = recordings[max(recordings.recordings)]
     began_ns, ended_ns = (epoch_ns + round((IDLE_S + after_s) * 1e9) for after_s in (0.0, LIVE_S))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tacpipe.arrays import Bools, Times
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import UsageError
 from tacpipe.live.messages import summarize_latencies
 from tacpipe.plugins.stage import Result
@@ -18,9 +19,6 @@ from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms
 from tacpipe.tasks.slip.live.messages import SLIP
 from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.windows import GraspTrack
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 

@@ -6,20 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+import numpy as np
+
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
+from tacpipe.plugins.stage import Attribute, Result
 from tacpipe.printable import listed
+from tacpipe.sensors.live import Declaration
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.sensors.plan import NAME as PLAN
-from tacpipe.tasks.slip.live.messages import DECLARATION, SLIP
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.slip.live.messages import DECLARATION, SLIP, SlipDescription
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.plugins.stage import Attribute, Result
     from tacpipe.recording.rig import Rig
-    from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.slip.live.engine import SlipEngine
     from tacpipe.tasks.task import PredictionRequest
 
@@ -84,10 +86,7 @@ class SlipLive(LiveTask):
 
         Raises `UsageError` if the model is the rule on forecasts.
         """
-        import numpy as np
-
         from tacpipe.tasks.slip.live.engine import SlipEngine
-        from tacpipe.tasks.slip.live.messages import SlipDescription
         from tacpipe.tasks.slip.model import SlipModel
         from tacpipe.tasks.slip.planned import PlannedMotion
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
+from tacpipe.sensors.live import Declaration
+from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.touch.live.messages import COLUMNS, DECLARATION, TOUCH
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.recording.rig import Rig
-    from tacpipe.sensors.live import Declaration
-    from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.touch.live.engine import TouchEngine
 
 

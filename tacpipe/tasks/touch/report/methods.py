@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import PredictorErrors, Question, Settings, distinct_names, marks
@@ -26,7 +27,6 @@ from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
 
 if TYPE_CHECKING:
-    from tacpipe.arrays import Floats
     from tacpipe.datasets.dataset import Dataset
 
 
