@@ -5,6 +5,7 @@ import os
 import random
 import shlex
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from tacpipe.engine.previous import Previous, Reusable
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
 from tacpipe.store import presence, records
+from tacpipe.store.records import Summary
 from tests.conftest import FileCalls, Lab
 from tests.test_presence import DAY_NS, FAULTS
 
@@ -175,9 +177,8 @@ def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_r
     assert reused_counts[-1] > 0
 
     def run_provenance() -> Any:
-        manifest_digest = file_digest(lab.folder / "data/s/manifest.json")
-        (run,) = [record for _, record in lab.store.records() if manifest_digest in records.digests(record["result"])]
-        return {"code": records.summary(run)["code"], "notes": records.summary(run)["notes"]}
+        summary = _run_summary(lab)
+        return {"code": summary["code"], "notes": summary["notes"]}
 
     by_taking = run_provenance()
     shutil.rmtree(lab.folder / ".tacpipe/presence")
@@ -186,7 +187,37 @@ def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_r
     assert sum(by_taking["code"]["named"].values()) == TRIALS
 
 
-def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_which(
+def test_results_of_different_code_are_reused_and_counted_by_code(
+    lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    from tacpipe.engine import provenance
+
+    names = [f"trial-{number:03d}" for number in range(TRIALS)]
+    (first_code,) = _run_summary(lab)["code"]["named"]
+    code_by_name = dict.fromkeys(names, first_code)
+    chance = random.Random(0)
+    for version in range(6):
+        code = str(version) * 64
+        monkeypatch.setattr(provenance, "code", lambda stage, code=code: code)
+        changed_names = chance.sample(names, chance.randint(1, 2))
+        lab.run(f"label data/r {' '.join(changed_names)} --set material={version}")
+        ran = lab.run_json(NAMED)
+        assert reused_counts[-1] > 0
+        assert (ran["ran"], ran["reused"]) == (len(changed_names), TRIALS - len(changed_names))
+        code_by_name |= dict.fromkeys(changed_names, code)
+        assert _run_summary(lab)["code"]["named"] == Counter(code_by_name.values())
+
+
+def _run_summary(lab: Lab) -> Summary:
+    """Return the summary of results in the record of the run that wrote data/s."""
+    manifest_digest = file_digest(lab.folder / "data/s/manifest.json")
+    (run,) = [record for _, record in lab.store.records() if manifest_digest in records.digests(record["result"])]
+    return records.summary(run)
+
+
+def test_nothing_is_reused_if_the_code_of_replaced_results_is_unknown(
     lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
@@ -196,11 +227,12 @@ def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_whic
     monkeypatch.setattr(provenance, "code", lambda stage: "0" * 64)
     lab.run("label data/r trial-003 --set material=felt")
     lab.run(NAMED)
-    assert reused_counts[-1] > 0
+    for path, record in [*lab.store.records()]:
+        if "run" not in record["identity"]:
+            Path(lab.store.record_path(path)).unlink()
     lab.run("label data/r trial-004 --set material=felt")
-    ran = lab.run_json(NAMED)
+    assert lab.run_json(NAMED)["ran"] == TRIALS
     assert reused_counts[-1] == 0
-    assert (ran["ran"], ran["reused"]) == (1, TRIALS - 1)
 
 
 @pytest.mark.parametrize("number", [0, -1])

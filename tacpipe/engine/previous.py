@@ -7,8 +7,9 @@ results exist, once this was checked.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tacpipe.datasets import manifest as manifest_of
@@ -16,8 +17,11 @@ from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import Pages
 from tacpipe.datasets.paths import shard_path
+from tacpipe.engine import keys
+from tacpipe.engine.outcome import Outcome
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.hashing import digest
+from tacpipe.plugins import registry
 from tacpipe.store import records
 from tacpipe.store.presence import Head, Look, Note
 from tacpipe.store.records import RecordingEntry, RunIdentity, Step, Summary
@@ -65,7 +69,6 @@ class Previous:
         earlier_pages = earlier_entries.pages.pages
         next_firsts = [*(page.first for page in earlier_pages[1:]), ""]
         reusable: dict[str, Pages] = {}
-        replaced_pages = set(range(len(results)))
         for page, next_first in zip(earlier_pages, next_firsts, strict=True):
             number = number_by_first.get(page.first)
             if page.digest not in present_digests or number is None or number == len(results):
@@ -75,10 +78,8 @@ class Previous:
             covers_page = firsts[number + 1] == next_first and result.recordings == page.recordings
             if covers_page and self.store.has(result.digest, result.bytes):
                 reusable[page.digest] = results.part(number)
-                replaced_pages.discard(number)
-        replaced_names = {name for number in replaced_pages for name in results.load(number).recordings}
-        count = sum(part.total("recordings") for part in reusable.values())
-        summary = self._summary(step["stage"], replaced_names, count)
+        replaced = [group for group in pages.groups(earlier_entries) if group.page not in reusable]
+        summary = self._summary(step, replaced, sum(part.total("recordings") for part in reusable.values()))
         return None if summary is None else Reusable(reusable, summary)
 
     def is_current(self) -> bool:
@@ -113,24 +114,71 @@ class Previous:
             and digest(result.chain[-1]) == digest(step)
         )
 
-    def _summary(self, stage: str, replaced_names: set[str], count: int) -> Summary | None:
-        """Return the summary of all results except ``replaced_names``, or None if it is unknown."""
-        summary = self.summary
-        codes = (summary.get("code") or {}).get(stage) or {}
-        packages = summary.get("packages") or {}
-        for counts in filter(None, (codes, *packages.values())):
-            if [*counts.values()] != [len(self.result.recordings)]:  # the code that computed each result is unknown
-                return None
-        excluded = {*replaced_names, ""}  # the empty name is a stage over a whole dataset, which runs again
+    def _summary(self, step: Step, replaced: Sequence[pages.RecordGroup], count: int) -> Summary | None:
+        """Return the summary of all results except those of the ``replaced`` groups, or None if it is unknown.
+
+        ``count`` is the number of the other results. Records of the replaced results are read only if the earlier run
+        has results of different code.
+        """
+        stage = step["stage"]
+        codes, packages = (self.summary.get("code") or {}).get(stage) or {}, self.summary.get("packages") or {}
+        earlier = [codes, *packages.values()] if codes else [*packages.values()]
+        if any(sum(counts.values()) != len(self.result.recordings) for counts in earlier):
+            return None
+        replaced_summaries: list[Summary] = []
+        if any(len(counts) > 1 for counts in earlier):
+            for group in replaced:
+                summary = self._group_summary(step, group.entries())
+                if summary is None:
+                    return None
+                replaced_summaries.append(summary)
+        replaced_codes = [(summary.get("code") or {}).get(stage) or {} for summary in replaced_summaries]
+        remaining = {stage: _remaining(codes, replaced_codes, count)} if codes else {}
+        remaining_packages = {
+            name: _remaining(
+                counts, [(summary.get("packages") or {}).get(name) or {} for summary in replaced_summaries], count
+            )
+            for name, counts in packages.items()
+        }
+        if any(sum(counts.values()) != count for counts in (*remaining.values(), *remaining_packages.values())):
+            return None
+        replaced_names = {name for group in replaced for name in group.entries()}
+        replaced_names.add("")  # the empty name is a stage over a whole dataset, which runs again
         notes = {
-            note: [name for name in names if name not in excluded]
-            for note, names in (summary.get("notes") or {}).items()
+            note: [name for name in names if name not in replaced_names]
+            for note, names in (self.summary.get("notes") or {}).items()
         }
         return {
-            "code": {stage: dict.fromkeys(codes, count)} if codes and count else {},
-            "packages": {name: dict.fromkeys(counts, count) for name, counts in packages.items() if count},
+            "code": {stage: counts for stage, counts in remaining.items() if counts},
+            "packages": {name: counts for name, counts in remaining_packages.items() if counts},
             "notes": {note: names for note, names in notes.items() if names},
         }
+
+    def _group_summary(self, step: Step, entries: Mapping[str, RecordingEntry]) -> Summary | None:
+        """Return the summary of the results of some input recordings, or None if a record is missing."""
+        record = self.store.record(digest(keys.of_group(step, registry.load_step(step["stage"]), entries)))
+        if record is not None:
+            return records.summary(record)
+        outcome = Outcome(self.directory)
+        for task in keys.shard_tasks(self.store, replace(self.source, recordings=entries), step, ()):
+            record = self.store.record(digest(task.identity))
+            if record is None:
+                return None
+            outcome.add_record(step["stage"], task.recording, record)
+        return outcome.of_results()
+
+
+def _remaining(counts: Mapping[str, int], replaced: Sequence[Mapping[str, int]], count: int) -> dict[str, int]:
+    """Return the number of results by code without the replaced results, whose numbers are known if there are several.
+
+    ``count`` is the number of all remaining results.
+    """
+    if len(counts) == 1:
+        return dict.fromkeys(counts, count) if count else {}
+    remaining = Counter(counts)
+    for replaced_counts in replaced:
+        remaining.subtract(replaced_counts)
+    return {code: number for code, number in remaining.items() if number}
 
 
 def inputs(store: Store, note: Note) -> Sequence[str]:
