@@ -29,8 +29,8 @@ from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.planner import send_plans
 from tacpipe.simulation.emulation.world import World
+from tacpipe.tasks.slip.live.demo import send_plans
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
 EFFORT = 1.15  # maximum load of the plan, relative to the friction limit: the plan of each trial causes slip

@@ -26,7 +26,7 @@ from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
-from tacpipe.tasks.touch.report.quantiles import measure_bands
+from tacpipe.tasks.touch.report import measure_bands
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -142,7 +142,6 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
         "cli/help.py",
         "cli/main.py",
         "exports/frames.py",
-        "live/extraction.py",
         "live/stages.py",
         "viewer/contents.py",
         "viewer/markers.py",

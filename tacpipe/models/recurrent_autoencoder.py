@@ -249,11 +249,6 @@ class RecurrentClassifier(nn.Module):
         return scores
 
 
-def count_weights(network: nn.Module) -> int:
-    """Return the number of weights of a network."""
-    return sum(weight.numel() for weight in network.parameters())
-
-
 def _run_layer(layer: nn.LSTM, inputs: Tensor, hidden: Tensor | None = None) -> Tensor:
     """Return the states (time, slide, hidden) of a layer. The initial cell is zero, and so is h if ``hidden`` is None."""
     from_input, from_state, *biases = layer.parameters()  # torch has two biases, and adds them

@@ -52,25 +52,6 @@ def hampel(values: AnyArray, rows: int, deviations: float, floor: float) -> tupl
 HALF, RANGE = 1 << 15, 1 << 16  # half range and range of 16-bit counts
 
 
-def unwrap(values: AnyArray) -> AnyArray:
-    """Return 16-bit integers ``values`` (time,) unwrapped as int32, or unchanged if they do not wrap.
-
-    A jump of more than half the range between consecutive samples is a wrap: no well-sampled signal changes that fast.
-    Recorded uSkin frames change by at most 5,000 counts.
-
-    >>> unwrap(np.array([65_530, 65_535, 4, 65_534], dtype=np.uint16)).tolist()
-    [65530, 65535, 65540, 65534]
-    """
-    if len(values) < 2 or int(values.max()) - int(values.min()) <= HALF:
-        return values
-    wide = values.astype(np.int32)
-    turned = count_wraps(wide)
-    if not turned.any():
-        return values
-    wide[1:] += RANGE * np.cumsum(turned, dtype=np.int32)
-    return wide
-
-
 def count_wraps(values: AnyArray) -> AnyArray:
     """Return the number of wraps before each row of ``values`` (time, …): 1, 0 or -1, (time - 1, …).
 

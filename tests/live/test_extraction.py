@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.live.extraction import extracted_streams, live_channels
+from tacpipe.live.stages import extracted_streams, live_channels
 from tacpipe.video.encoding import encode_images, jpeg_format
 from tacpipe.video.files import packet_stream
 from tests.fake_recordings import FakeRecording

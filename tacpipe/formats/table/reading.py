@@ -176,11 +176,6 @@ def stream_batches(
     return _batches(file, stream, recording, columns.NO_DECLARATION, {}, shared, stamps_ns)
 
 
-def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = None) -> pa.Table:
-    """Return `stream_batches` of a file as one table."""
-    return stream_batches(rows.open_rows(path, stream), stream, recording).read_all()
-
-
 def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 

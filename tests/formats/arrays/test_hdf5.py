@@ -9,13 +9,14 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import container
-from tacpipe.formats.table import layout, reading
+from tacpipe.formats.table import layout
 from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.arrays import files
 from tests.formats.builders import about, layout_params
+from tests.formats.table import labs
 
 NONE = Params()
 HDF5 = ContainerCommand("hdf5")
@@ -291,7 +292,7 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
         { match = "fx", quantity = "force", unit = "N", component = "x" },
     ]
     """
-    text = reading.read_stream_table(
+    text = labs.read_stream_table(
         tmp_path / "run.csv", layout.parse_layout(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0]
     )
     (result,) = read(tmp_path, layout_params(f'[streams.skin]\nsource = "skin"\n{columns}')).values()

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
-from tacpipe.formats.table import layout
+from tacpipe.formats.table import layout, reading
+from tacpipe.formats.table import rows as table_rows
 from tacpipe.formats.table.layout import Layout, StreamLayout
 
 START_S = 1_700_000_000
@@ -30,6 +32,11 @@ def write(folder: Path, trials: int = 3, **options: Any) -> list[pd.DataFrame]:
         output.append(frame(seed=trial))
         output[-1].to_csv(place / "skin.csv", index=False, **options)
     return output
+
+
+def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = None) -> pa.Table:
+    """Return the rows of a file as a stream, read at once."""
+    return reading.stream_batches(table_rows.open_rows(path, stream), stream, recording).read_all()
 
 
 def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> StreamLayout:

@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.formats.table import file_sample, guess, labels, layout, pattern, reading, recordings
+from tacpipe.formats.table import file_sample, guess, labels, layout, pattern, recordings
 from tests.formats.table import labs
 
 
@@ -24,7 +24,7 @@ def test_a_guess_with_its_questions_answered_reads_what_pandas_wrote(tmp_path: P
     result = answered(text, unit="N", sensor="mine")
     assert result.streams[0].separator == ";" and result.streams[0].decimal == ","
     for entry, frame in zip(recordings.find_recordings(result, tmp_path), frames, strict=True):
-        table = reading.read_stream_table(entry.files["skin"], result.streams[0])
+        table = labs.read_stream_table(entry.files["skin"], result.streams[0])
         assert np.array_equal(table.column("fx").to_numpy(), frame["fx"].to_numpy())
         assert table.column("taxel3").to_pylist() == frame["taxel3"].tolist()
         assert abs(table.column("t_ns")[0].as_py() - labs.START_S * 10**9) == 0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.container import Time
-from tacpipe.formats.table import contained, guess, layout, reading, recordings, stamps
+from tacpipe.formats.table import contained, guess, layout, recordings, stamps
 from tests.formats.table import labs
 
 SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
@@ -129,10 +129,10 @@ def test_columns_without_a_header_are_placed_in_an_array_by_one_rule(tmp_path: P
 def test_a_list_names_the_columns_of_a_file_without_a_header(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("0.5,3\n1.5,4\n")
     stream = labs.stream('header = ["time", "fx"]', '{ match = "fx" }', "{trial}.csv")
-    assert reading.read_stream_table(tmp_path / "a.csv", stream).column("fx").to_pylist() == [3.0, 4.0]
+    assert labs.read_stream_table(tmp_path / "a.csv", stream).column("fx").to_pylist() == [3.0, 4.0]
     (tmp_path / "a.csv").write_text("0.5,3,1\n1.5,4,1\n")
     with pytest.raises(TacpipeError, match=r"3 cells.*2 columns"):
-        reading.read_stream_table(tmp_path / "a.csv", stream)
+        labs.read_stream_table(tmp_path / "a.csv", stream)
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig", "utf-8"])
@@ -232,7 +232,7 @@ def test_times_of_day_go_on_past_midnight_and_have_the_day_that_the_layout_state
     rows = ["23:59:59.5,1", "23:59:59.75,2", "00:00:00,3", "00:00:00.25,4"]
     (tmp_path / "a.csv").write_text("\n".join(["clock,fx", *rows]))
     extra = 'time = { column = "clock", format = "%H:%M:%S.%f", start = "1970-01-02", zone = "Europe/Berlin" }'
-    table = reading.read_stream_table(tmp_path / "a.csv", labs.stream(extra, '{ match = "fx" }', "{trial}.csv"))
+    table = labs.read_stream_table(tmp_path / "a.csv", labs.stream(extra, '{ match = "fx" }', "{trial}.csv"))
     midnight_ns = (2 * 86_400 - 3600) * 10**9  # midnight of the third of January in Berlin
     assert table.column("t_ns").to_pylist() == [midnight_ns + part * 250_000_000 for part in (-2, -1, 0, 1)]
 

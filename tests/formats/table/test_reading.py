@@ -34,7 +34,7 @@ def expect(table: pa.Table, frame: pd.DataFrame) -> None:
 
 def test_a_csv_that_pandas_wrote_is_read_to_the_bit(tmp_path: Path) -> None:
     (frame,) = labs.write(tmp_path, 1)
-    expect(reading.read_stream_table(tmp_path / "trial_0/skin.csv", labs.stream()), frame)
+    expect(labs.read_stream_table(tmp_path / "trial_0/skin.csv", labs.stream()), frame)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_a_csv_that_pandas_wrote_is_read_to_the_bit(tmp_path: Path) -> None:
 )
 def test_other_ways_to_write_the_same_table_give_the_same(tmp_path: Path, options: dict[str, str], extra: str) -> None:
     (frame,) = labs.write(tmp_path, 1, **options)
-    expect(reading.read_stream_table(tmp_path / "trial_0/skin.csv", labs.stream(extra)), frame)
+    expect(labs.read_stream_table(tmp_path / "trial_0/skin.csv", labs.stream(extra)), frame)
 
 
 def test_a_compressed_file_with_comments_and_lines_before_its_header_gives_the_same(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_compressed_file_with_comments_and_lines_before_its_header_gives_the_s
     text = frame.to_csv(index=False).splitlines()
     lines = ["recorded by nobody", "", *text[:1], "# pause", *text[1:20], "", "  # more", *text[20:]]
     (tmp_path / "skin.csv.gz").write_bytes(gzip.compress("\n".join(lines).encode()))
-    expect(reading.read_stream_table(tmp_path / "skin.csv.gz", labs.stream('skip_lines = 2\ncomment = "#"')), frame)
+    expect(labs.read_stream_table(tmp_path / "skin.csv.gz", labs.stream('skip_lines = 2\ncomment = "#"')), frame)
 
 
 def test_a_file_without_header_has_numbered_columns(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_a_file_without_header_has_numbered_columns(tmp_path: Path) -> None:
         '{ match = "column6", name = "force_x_n", unit = "N" }, '
         '{ match = "column{taxel}", name = "cell{taxel}", type = "uint16" }'
     )
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.csv", labs.stream('header = false\ntime = { column = "column1" }', columns)
     )
     assert table.column("cell2").to_pylist() == frame["taxel1"].tolist()
@@ -79,7 +79,7 @@ def test_parquet_npz_and_json_lines_give_the_same_as_csv(tmp_path: Path) -> None
     np.savez(tmp_path / "skin.npz", allow_pickle=False, **{str(name): frame[name].to_numpy() for name in frame})
     frame.to_json(tmp_path / "skin.jsonl", orient="records", lines=True, double_precision=15)
     for name in ("skin.parquet", "skin.npz", "skin.jsonl"):
-        table = reading.read_stream_table(tmp_path / name, labs.stream())
+        table = labs.read_stream_table(tmp_path / name, labs.stream())
         expect(table.set_column(0, "t_ns", pa.array(T_NS)), frame)
         assert np.abs(table.column("t_ns").to_numpy() - T_NS).max() < 240  # resolution of Unix seconds in float64
 
@@ -88,7 +88,7 @@ def test_arrays_of_two_dimensions_are_columns(tmp_path: Path) -> None:
     grid = np.arange(12, dtype=np.uint16).reshape(3, 2, 2)
     np.savez(tmp_path / "skin.npz", stamp=np.arange(3) * 10**9, grid=grid)
     columns = '{ match = "grid_{cell}", type = "uint16" }'
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.npz", labs.stream('time = { column = "stamp", unit = "ns" }', columns)
     )
     assert [table.column(f"grid_{cell}").to_pylist() for cell in range(4)] == grid.reshape(3, 4).T.tolist()
@@ -97,7 +97,7 @@ def test_arrays_of_two_dimensions_are_columns(tmp_path: Path) -> None:
 def test_long_form_becomes_a_column_a_channel(tmp_path: Path) -> None:
     frame = labs.frame()
     frame.melt("time", var_name="sensor", value_name="reading").to_csv(tmp_path / "skin.csv", index=False)
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }')
     )
     expect(table, frame)
@@ -106,7 +106,7 @@ def test_long_form_becomes_a_column_a_channel(tmp_path: Path) -> None:
 def test_a_moment_at_which_a_channel_is_missing_is_nan_in_long_form(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fy,2\n1,fx,3\n")
     extra = 'long = { channel = "sensor", value = "reading" }\ntime = { column = "time", origin = "start" }'
-    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "f{component}" }'))
+    table = labs.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "f{component}" }'))
     assert table.column("fx").to_pylist() == [1.0, 3.0]
     assert np.isnan(table.column("fy")[1].as_py())
 
@@ -114,7 +114,7 @@ def test_a_moment_at_which_a_channel_is_missing_is_nan_in_long_form(tmp_path: Pa
 def test_two_values_of_a_channel_at_one_moment_are_refused(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fx,2\n")
     with pytest.raises(TacpipeError, match=r"two values of fx .* line 3"):
-        reading.read_stream_table(
+        labs.read_stream_table(
             tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
         )
 
@@ -125,28 +125,28 @@ def test_the_rows_of_one_recording_are_picked_from_a_file_of_many(tmp_path: Path
     all_items.to_csv(tmp_path / "all.csv", index=False)
     stream = labs.stream('recording = "trial"', files="all.csv")
     for name, frame in frames.items():
-        expect(reading.read_stream_table(tmp_path / "all.csv", stream, name), frame)
+        expect(labs.read_stream_table(tmp_path / "all.csv", stream, name), frame)
 
 
 def test_a_rate_makes_the_stamps_where_no_column_has_them(tmp_path: Path) -> None:
     frame = labs.frame().drop(columns="time")
     frame.to_csv(tmp_path / "skin.csv", index=False)
     extra = 'time = { rate_hz = 100, start = "2023-11-14T22:13:20" }'
-    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra))
+    table = labs.read_stream_table(tmp_path / "skin.csv", labs.stream(extra))
     expect(table, frame)
     assert table.schema.field("t_ns").metadata[b"made"] == b"from rate"
 
 
 def test_missing_cells_are_nan_where_they_are_declared(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,fx\n0,1.5\n1,NA\n2,\n")
-    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream('missing = ["NA", ""]', '{ match = "fx" }'))
+    table = labs.read_stream_table(tmp_path / "skin.csv", labs.stream('missing = ["NA", ""]', '{ match = "fx" }'))
     assert table.column("fx").to_pylist()[0] == 1.5
     assert np.isnan(table.column("fx").to_numpy()[1:]).all()
 
 
 def test_a_scaled_column_is_in_its_unit(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,fx\n0,1500\n1,-20\n")
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.csv", labs.stream("", '{ match = "fx", unit = "N", scale = 0.001 }')
     )
     assert table.column("fx").to_pylist() == [1.5, -0.02]
@@ -177,7 +177,7 @@ def test_a_wrong_file_is_one_sentence_with_its_place(tmp_path: Path, content: st
     path = tmp_path / "skin.csv"
     path.write_text(content)
     with pytest.raises(TacpipeError) as result:
-        reading.read_stream_table(path, labs.stream())
+        labs.read_stream_table(path, labs.stream())
     assert all(part in str(result.value) for part in (str(path), *WRONG[content])), str(result.value)
     assert "\n" not in str(result.value)
 
@@ -190,7 +190,7 @@ def test_a_value_that_is_wrong_in_a_later_block_is_named_by_its_line(
     rows[80] = "80,1,inf"
     (tmp_path / "skin.csv").write_text("\n".join(["time,taxel1,fx", *rows]))
     with pytest.raises(TacpipeError, match="line 82"):
-        reading.read_stream_table(tmp_path / "skin.csv", labs.stream())
+        labs.read_stream_table(tmp_path / "skin.csv", labs.stream())
 
 
 def test_a_wrong_stamp_of_one_recording_in_long_form_is_named_by_its_line(
@@ -202,14 +202,14 @@ def test_a_wrong_stamp_of_one_recording_in_long_form_is_named_by_its_line(
     (tmp_path / "skin.csv").write_text("\n".join(["time,sensor,reading,trial", *rows]))
     extra = 'recording = "trial"\nmissing = ["NA"]\nlong = { channel = "sensor", value = "reading" }'
     with pytest.raises(TacpipeError, match="line 82"):
-        reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "fx" }'), "a")
+        labs.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "fx" }'), "a")
 
 
 def same_in_blocks(
     monkeypatch: pytest.MonkeyPatch, path: Path, stream: StreamLayout, recording: str | None = None
 ) -> pa.Table:
     """Return what a file holds, which is read to the same bytes in one block and in many."""
-    table = reading.read_stream_table(path, stream, recording)
+    table = labs.read_stream_table(path, stream, recording)
     for module in (text, binary):
         monkeypatch.setattr(module, "BLOCK_BYTES", 200)
     batches = list(reading.stream_batches(rows.open_rows(path, stream), stream, recording))
@@ -252,7 +252,7 @@ def test_stamps_that_run_backwards_between_two_blocks_are_named(
     frame.to_csv(tmp_path / "skin.csv", index=False)
     monkeypatch.setattr(text, "BLOCK_BYTES", len(frame[:30].to_csv(index=False)) - len(frame[:0].to_csv(index=False)))
     with pytest.raises(TacpipeError, match=r"line 32: the stamp is 0\.99"):
-        reading.read_stream_table(tmp_path / "skin.csv", labs.stream())
+        labs.read_stream_table(tmp_path / "skin.csv", labs.stream())
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -272,7 +272,7 @@ def test_an_archive_that_declares_more_than_it_holds_is_refused(tmp_path: Path) 
     with zipfile.ZipFile(tmp_path / "skin.npz", "w") as archive:
         archive.writestr("time.npy", header.getvalue())
     with pytest.raises(TacpipeError, match="more values than it has bytes for"):
-        reading.read_stream_table(tmp_path / "skin.npz", labs.stream())
+        labs.read_stream_table(tmp_path / "skin.npz", labs.stream())
 
 
 def test_a_key_that_only_later_lines_have_is_a_column_and_lists_of_two_lengths_are_refused(
@@ -281,20 +281,18 @@ def test_a_key_that_only_later_lines_have_is_a_column_and_lists_of_two_lengths_a
     monkeypatch.setattr(binary, "BLOCK_BYTES", 30)
     lines = [{"time": row, **({"fx": row / 2} if row > 30 else {})} for row in range(50)]
     (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    table = (
-        reading.read_stream_table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "fx" }')).column("fx").to_numpy()
-    )
+    table = labs.read_stream_table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "fx" }')).column("fx").to_numpy()
     assert np.isnan(table[:31]).all() and table[31:].tolist() == [row / 2 for row in range(31, 50)]
     uneven = [{"time": row, "x": [1] * (2 + row // 30)} for row in range(50)]
     (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, uneven)))
     with pytest.raises(TacpipeError, match="lists of x have 2 lengths"):
-        reading.read_stream_table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "x_*" }'))
+        labs.read_stream_table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "x_*" }'))
 
 
 def test_a_key_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
     (tmp_path / "skin.jsonl").write_bytes(b'{"time": 1, "f\xff": 2}\n')
     with pytest.raises(TacpipeError, match="not JSON lines"):
-        reading.read_stream_table(tmp_path / "skin.jsonl", labs.stream())
+        labs.read_stream_table(tmp_path / "skin.jsonl", labs.stream())
 
 
 def test_a_file_that_is_one_endless_line_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -303,19 +301,19 @@ def test_a_file_that_is_one_endless_line_is_refused(monkeypatch: pytest.MonkeyPa
     for start in ("", "time,fx\n1,2\n"):
         (tmp_path / "skin.csv").write_text(start + "1" * 3000)
         with pytest.raises(TacpipeError, match="a line of over 1000 bytes"):
-            reading.read_stream_table(tmp_path / "skin.csv", labs.stream("", '{ match = "fx" }'))
+            labs.read_stream_table(tmp_path / "skin.csv", labs.stream("", '{ match = "fx" }'))
 
 
 def test_pickles_in_an_archive_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "skin.npz", time=np.array([{}, {}], dtype=object))
     with pytest.raises(TacpipeError, match=r"skin\.npz"):
-        reading.read_stream_table(tmp_path / "skin.npz", labs.stream())
+        labs.read_stream_table(tmp_path / "skin.npz", labs.stream())
 
 
 def test_json_lines_with_lists_are_columns(tmp_path: Path) -> None:
     lines = [json.dumps({"time": row, "taxels": [row, row + 1]}) for row in range(3)]
     (tmp_path / "skin.jsonl").write_text("\n".join(lines))
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.jsonl", labs.stream("", '{ match = "taxels_{taxel}", type = "uint16" }')
     )
     assert table.column("taxels_1").to_pylist() == [1, 2, 3]
@@ -335,7 +333,7 @@ def test_a_long_form_of_many_runs_is_the_table_that_pandas_pivots(
     rows = rows.sample(frac=1.0, random_state=2) if order == "mixed" else rows
     rows.to_csv(tmp_path / "skin.csv", index=False)
     columns = '{ match = "*" }'
-    table = reading.read_stream_table(
+    table = labs.read_stream_table(
         tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', columns)
     )
     expected = rows.pivot(index="time", columns="sensor", values="reading")
@@ -354,14 +352,14 @@ def test_of_a_long_form_of_many_runs_the_second_of_two_values_is_named_by_its_li
     (tmp_path / "skin.csv").write_text("\n".join(["time,sensor,reading", *rows]) + "\n")
     stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
     with pytest.raises(TacpipeError, match=r"two values of fx .* line 52\b"):
-        reading.read_stream_table(tmp_path / "skin.csv", stream)
+        labs.read_stream_table(tmp_path / "skin.csv", stream)
 
 
 def test_a_row_of_a_long_form_that_names_no_channel_is_named_by_its_line(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n1,,2\n")
     stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "fx" }')
     with pytest.raises(TacpipeError, match=r"line 3, column sensor"):
-        reading.read_stream_table(tmp_path / "skin.csv", stream)
+        labs.read_stream_table(tmp_path / "skin.csv", stream)
 
 
 def test_a_long_form_whose_channels_are_numbers_without_end_is_refused(
@@ -371,4 +369,4 @@ def test_a_long_form_whose_channels_are_numbers_without_end_is_refused(
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n" + "".join(f"{row},{row}.5,1\n" for row in range(9)))
     stream = labs.stream('long = { channel = "sensor", value = "reading" }', '{ match = "*" }')
     with pytest.raises(TacpipeError, match=r"column sensor names more than 5 channels"):
-        reading.read_stream_table(tmp_path / "skin.csv", stream)
+        labs.read_stream_table(tmp_path / "skin.csv", stream)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.container import Time, TimeUnit
-from tacpipe.formats.table import reading, stamps
+from tacpipe.formats.table import stamps
 from tacpipe.formats.table.layout import ColumnRule, StreamLayout
+from tests.formats.table import labs
 
 YEAR_2262_NS = 2**63 - 1
 
@@ -96,7 +97,7 @@ def test_a_stamp_beyond_every_range_is_refused_and_names_its_row(tmp_path: Path,
     path.write_text(f"time,a\n0,1\n{text},2\n")
     stream = StreamLayout("skin", time=Time(column="time", unit=unit), columns=(ColumnRule(match="a"),))
     with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
-        reading.read_stream_table(path, stream)
+        labs.read_stream_table(path, stream)
 
 
 @given(
@@ -116,7 +117,7 @@ def test_a_number_with_any_exponent_is_its_exact_time_or_refused(
     stream = StreamLayout("skin", time=Time(column="time", unit=unit), columns=(ColumnRule(match="a"),))
     exact = Fraction(text) * 10 ** stamps.DIGITS[unit]
     try:
-        t_ns = reading.read_stream_table(path, stream)["t_ns"].to_pylist()
+        t_ns = labs.read_stream_table(path, stream)["t_ns"].to_pylist()
     except TacpipeError as error:
         assert "line 2, column time" in str(error)
         return
@@ -130,4 +131,4 @@ def test_a_number_that_128_bits_hold_as_a_stamp_of_today_is_refused(tmp_path: Pa
     path.write_text(f"time,a\n0,1\n{cell},2\n")
     stream = StreamLayout("skin", time=Time(column="time"), columns=(ColumnRule(match="a"),))
     with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
-        reading.read_stream_table(path, stream)
+        labs.read_stream_table(path, stream)

@@ -19,8 +19,8 @@ from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.live.decoding import BatchColumns
-from tacpipe.live.extraction import live_channels
 from tacpipe.live.plans import PlanHistory
+from tacpipe.live.stages import live_channels
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed

@@ -20,8 +20,7 @@ from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.extraction import extracted_streams
-from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
+from tacpipe.live.stages import RecordingsInMemory, extracted_streams, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.forward import evaluation

@@ -11,8 +11,7 @@ import numpy as np
 from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
-from tacpipe.live.extraction import extracted_streams
-from tacpipe.live.stages import streams_as_recorded
+from tacpipe.live.stages import extracted_streams, streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.store.records import Step

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.channels.streams import GRID, max_step
 from tacpipe.errors import TacpipeError
-from tacpipe.live.extraction import CHANNELS
-from tacpipe.live.stages import stage_params
+from tacpipe.live.stages import CHANNELS, stage_params
 
 if TYPE_CHECKING:
     from tacpipe.store.records import Step

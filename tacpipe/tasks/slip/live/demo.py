@@ -7,10 +7,14 @@ and the alarms are printed, and drawn. Seeds and parameters of the simulation ar
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +26,39 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
+from tacpipe.sensors import plan
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.planner import send_plans
 from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.slip.calibration import EventScore
-from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.windows import GraspTrack
+from tacpipe.tasks.slip.windows import GraspTrack, SlipLabels, merge_events, run_times
+
+
+@contextlib.contextmanager
+def send_plans(emulator: Emulator, port: int, rate_hz: float) -> Iterator[None]:
+    """Send plans at a rate to a UDP port of this computer in the block."""
+    is_over = threading.Event()
+    offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def send_repeatedly() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
+            while not is_over.wait(1 / rate_hz):
+                since_ns = time.monotonic_ns() - emulator.epoch_ns
+                t_ns = since_ns + pick_and_move.plan_points_ns()
+                poses = emulator.world.arm(t_ns)[:, 1:]
+                packet = plan.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses)
+                controller.sendto(packet, ("127.0.0.1", port))
+
+    controller = threading.Thread(target=send_repeatedly, daemon=True)
+    controller.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        controller.join()
+
 
 TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # ratio of the plan's largest load to the friction limit: each trial slips because of its plan

@@ -15,7 +15,8 @@ from tacpipe.comparison.runs import Method
 from tacpipe.report import context
 from tacpipe.report.blocks import Charts, Fold, Section, Table
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch.report import NO_EVIDENCE, figures, quantiles
+from tacpipe.tasks.touch import report
+from tacpipe.tasks.touch.report import NO_EVIDENCE, figures
 from tacpipe.tasks.touch.report.methods import TouchResult
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -289,7 +290,7 @@ def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() 
     runs = pd.concat([rows(0), rows(1)])
     for is_known, cluster in ((True, "recording"), (False, "object")):
         part = runs[runs.known == is_known]
-        band = quantiles.measure_bands(part, is_known)["e_mf", "model"]
+        band = report.measure_bands(part, is_known)["e_mf", "model"]
         model_rows = part[(part.target == "e_mf") & (part.predictor == "model")]
         assert band.values == len(model_rows) == 2 * 2 * 10 * 24
         assert band.coverage[0] == model_rows.covered.mean()
