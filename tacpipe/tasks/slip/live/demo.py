@@ -31,9 +31,10 @@ from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.slip.calibration import EventScore
+from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.windows import GraspTrack, SlipLabels, merge_events, run_times
+from tacpipe.tasks.slip.windows import GraspTrack
 
 
 @contextlib.contextmanager
