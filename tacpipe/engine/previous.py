@@ -120,28 +120,21 @@ class Previous:
         ``count`` is the number of the other results. Records of the replaced results are read only if the earlier run
         has results of different code.
         """
-        stage = step["stage"]
-        codes, packages = (self.summary.get("code") or {}).get(stage) or {}, self.summary.get("packages") or {}
-        earlier = [codes, *packages.values()] if codes else [*packages.values()]
-        if any(sum(counts.values()) != len(self.result.recordings) for counts in earlier):
+        earlier = _counts_by_code(self.summary, step["stage"])
+        if any(sum(counts.values()) != len(self.result.recordings) for counts in earlier.values()):
             return None
-        replaced_summaries: list[Summary] = []
-        if any(len(counts) > 1 for counts in earlier):
+        replaced_counts: list[_CountsByCode] = []
+        if any(len(counts) > 1 for counts in earlier.values()):
             for group in replaced:
                 summary = self._group_summary(step, group.entries())
                 if summary is None:
                     return None
-                replaced_summaries.append(summary)
-        replaced_codes = [(summary.get("code") or {}).get(stage) or {} for summary in replaced_summaries]
-        remaining = {stage: _remaining(codes, replaced_codes, count)} if codes else {}
-        remaining_packages = {
-            name: _remaining(
-                counts, [(summary.get("packages") or {}).get(name) or {} for summary in replaced_summaries], count
-            )
-            for name, counts in packages.items()
-        }
-        if any(sum(counts.values()) != count for counts in (*remaining.values(), *remaining_packages.values())):
-            return None
+                replaced_counts.append(_counts_by_code(summary, step["stage"]))
+        remaining: _CountsByCode = {}
+        for source, counts in earlier.items():
+            remaining[source] = _subtract(counts, [part.get(source, {}) for part in replaced_counts], count)
+            if sum(remaining[source].values()) != count:
+                return None
         replaced_names = {name for group in replaced for name in group.entries()}
         replaced_names.add("")  # the empty name is a stage over a whole dataset, which runs again
         notes = {
@@ -149,8 +142,8 @@ class Previous:
             for note, names in (self.summary.get("notes") or {}).items()
         }
         return {
-            "code": {stage: counts for stage, counts in remaining.items() if counts},
-            "packages": {name: counts for name, counts in remaining_packages.items() if counts},
+            "code": {name: counts for (kind, name), counts in remaining.items() if kind == "code" and counts},
+            "packages": {name: counts for (kind, name), counts in remaining.items() if kind == "packages" and counts},
             "notes": {note: names for note, names in notes.items() if names},
         }
 
@@ -168,8 +161,18 @@ class Previous:
         return outcome.of_results()
 
 
-def _remaining(counts: Mapping[str, int], replaced: Sequence[Mapping[str, int]], count: int) -> dict[str, int]:
-    """Return the number of results by code without the replaced results, whose numbers are known if there are several.
+_CountsByCode = dict[tuple[str, str], dict[str, int]]  # number of results by digest of the code, by kind and name
+
+
+def _counts_by_code(summary: Summary, stage: str) -> _CountsByCode:
+    """Return how many results the code of ``stage``, and of each package, computed."""
+    stage_counts = (summary.get("code") or {}).get(stage)
+    packages = {("packages", name): counts for name, counts in (summary.get("packages") or {}).items()}
+    return {**({("code", stage): stage_counts} if stage_counts else {}), **packages}
+
+
+def _subtract(counts: Mapping[str, int], replaced: Sequence[Mapping[str, int]], count: int) -> dict[str, int]:
+    """Return the number of results by code without the replaced ones, which are all of the same code if there is one.
 
     ``count`` is the number of all remaining results.
     """
