@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp, schema
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 USKIN_PITCH_M = 0.0047  # pitch of the taxels of a XELA uSkin 4x4, an assumption
 ROBOSKIN_PITCH_M = 0.0067  # pitch of the taxels of a RoboSkin triangle

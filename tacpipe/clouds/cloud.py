@@ -7,18 +7,16 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, Bytes, Counts, Float32s, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.printable import plain
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 POSITION = ("x_m", "y_m", "z_m")
 COLOUR = ("red", "green", "blue")
@@ -65,8 +63,6 @@ class Cloud:
 
     def table(self) -> pa.Table:
         """Return one row per point: ``x_m``, ``y_m``, ``z_m`` float32 and, with colours, ``red`` … ``blue`` uint8."""
-        import pyarrow as pa
-
         position = {"unit": "m", "quantity": "position"}
         fields = [pa.field(name, pa.float32(), metadata={**position, "component": name[0]}) for name in POSITION]
         values = list(self.points_m.T)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.clouds.cloud import require_columns
 from tacpipe.errors import TacpipeError
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{axis}_{component}" for axis in "xyz" for component in "xyz")
@@ -94,8 +90,6 @@ class Grasp:
 
         ``wrist_x_y`` is the component along y of the wrist's first axis.
         """
-        import pyarrow as pa
-
         from tacpipe.channels import schema as channels
 
         fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,16 +14,11 @@ from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import gap_mask as gap_mask
 from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
+from tacpipe.datasets.dataset import Recording
 from tacpipe.errors import TacpipeError
+from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import SOME_ROWS
 from tacpipe.plugins.stage import Fitted
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.io.columns import Columns
-
 
 LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes the position of a channel
 

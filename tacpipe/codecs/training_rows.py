@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -13,12 +13,9 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.codecs import codec, measures, tactile
 from tacpipe.codecs.codec import check_channels
 from tacpipe.datasets import splits
+from tacpipe.datasets.dataset import Recording
 from tacpipe.errors import TacpipeError
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.io.columns import Columns
-
+from tacpipe.io.columns import Columns
 
 HELD_OUT = 0.15  # fraction of the training recordings that measure a codec
 log = logging.getLogger(__name__)

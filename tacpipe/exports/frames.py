@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, ArrayType
 from tacpipe.channels.streams import GRID, TRUTH
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.exports import contents
 from tacpipe.exports.contents import TIME, Contents, Loss
+from tacpipe.io.columns import Columns
 from tacpipe.printable import listed, plain
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.io.columns import Columns
 
 RATE = "grid_rate_hz"  # attribute of a synchronized recording
 LEFT_OUT = "not_synchronized"  # attribute with the streams that `synchronize` skipped

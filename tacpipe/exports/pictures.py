@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+
+import pyarrow as pa
 
 from tacpipe.exports.contents import TIME
+from tacpipe.exports.ros import Topic
+from tacpipe.io.columns import Columns
 from tacpipe.video.decoding import jpeg_images, read_batches
 from tacpipe.video.stream import KEY_FRAME, PACKET, VideoFormat, in_decode_order
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.exports.ros import Topic
-    from tacpipe.io.columns import Columns
 
 PLAYED = {"h264": "h264", "hevc": "h265", "vp9": "vp9", "av1": "av1"}  # codecs that Foxglove plays, with its names
 VIDEO, IMAGE = "foxglove_msgs/CompressedVideo", "sensor_msgs/CompressedImage"

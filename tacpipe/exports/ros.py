@@ -16,17 +16,15 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports.contents import TIME, field_metadata, stream_label
 from tacpipe.formats.arrays.tree import picture_encoding
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 HEADER = b"\x00\x01\x00\x00"  # start of each message: CDR, little endian; alignment is relative to its end
 NS = 1_000_000_000
@@ -217,8 +215,6 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
     Its metadata contain the original names and metadata of stream and columns. Columns of types that no message
     supports are omitted; a missing integer becomes 0, a missing float NaN, a missing text empty.
     """
-    import pyarrow as pa
-
     t_ns = table.column(TIME).to_numpy()
     names = [field.name for field in table.schema if field.name != TIME and str(field.type) in TYPES]
     fields = field_names(names)
@@ -359,8 +355,6 @@ def columns_of_quantity(table: pa.Table, quantity: str) -> list[str]:
 
 def column_numbers(column: pa.ChunkedArray) -> AnyArray:
     """Return a column as little-endian numbers (time,); missing values are NaN, or 0 for integers."""
-    import pyarrow as pa
-
     filler = float("nan") if pa.types.is_floating(column.type) else pa.scalar(0).cast(column.type)
     values: AnyArray = (column.fill_null(filler) if column.null_count else column).to_numpy()
     return values.astype(values.dtype.newbyteorder("<"), copy=False)
@@ -391,8 +385,6 @@ def topic_part(stream: str) -> str:
 
 
 def _is_number(kind: pa.DataType) -> bool:
-    import pyarrow as pa
-
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 T = TypeVar("T")
 SENSORS = {"xela1": "xela_sensor1.csv", "xela2": "xela_sensor2.csv"}
@@ -27,8 +25,6 @@ UNIT_TOLERANCE = 1e-3  # tolerance of a quaternion's norm; recordings have less 
 
 def read_uskin(path: Path) -> list[Counts]:
     """Return the 48 columns of a uSkin, each (time,), uint16 counts, ordered by taxel."""
-    import pyarrow as pa
-
     from tacpipe.formats.csv_table import read_csv
 
     names = [f"txl{taxel}_{axis}" for taxel in range(1, schema.TAXELS + 1) for axis in schema.AXES]

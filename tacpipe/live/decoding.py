@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Indices
 from tacpipe.recording.reading import Batch, LinkReader
@@ -12,9 +11,6 @@ from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 class Decoder:
@@ -128,16 +124,12 @@ class BatchColumns:
 
     def table(self) -> pa.Table:
         """Return the batch as a table."""
-        import pyarrow as pa
-
         arrays = [pa.array(self.column(number), field.type) for number, field in enumerate(self.schema)]
         return pa.Table.from_arrays(arrays, schema=self.schema)
 
 
 def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
     """Return the recorded schema of a stream, with a device clock if ``device``, and with the columns ``counters``."""
-    import pyarrow as pa
-
     from tacpipe.channels import schema as schemas
 
     return pa.schema([schemas.time_field(), *schemas.device_fields(clock=device, counters=counters), *sensor.fields()])

@@ -5,24 +5,21 @@ from __future__ import annotations
 import bisect
 import ipaddress
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.errors import UsageError
 from tacpipe.links import network
 from tacpipe.links.link import Address
+from tacpipe.live.decoding import BatchColumns
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.plan import MEASURED, POSE
 from tacpipe.sensors.plan import NAME as PLAN
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.live.decoding import BatchColumns
 
 LOCAL = "127.0.0.1"  # default host of plans by UDP
 RIG = "rig"  # scheme of a plan from a stream of the rig

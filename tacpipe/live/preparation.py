@@ -8,8 +8,9 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.live import publishing, wire
@@ -21,9 +22,6 @@ from tacpipe.recording import recorder
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.sensor import Options
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 CONFIG = "config.json"
 PATHS = ("model",)

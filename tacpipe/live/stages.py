@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pyarrow as pa
+
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import UsageError
+from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute, RecordingOutput
+from tacpipe.store.records import Step
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
 from tacpipe.video.stream import read_format
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.io.columns import Columns
-    from tacpipe.store.records import Step
-
 
 # earlier versions whose params today's stage reads and whose rows it reproduces
 EARLIER_VERSIONS = {"synchronize": (2,)}
@@ -67,7 +64,6 @@ class RecordingInMemory:
 
     def columns(self, stream: str = "") -> Columns:
         """Return the columns of a stream, as those of a stored recording."""
-        from tacpipe.io.columns import Columns
         from tacpipe.io.parquet import to_parquet
 
         return Columns(to_parquet(self.tables[stream]))

@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.datasets import directory, paths
@@ -26,9 +27,6 @@ from tacpipe.recording.sealing import Sealed, events_table
 from tacpipe.recording.spool import Spooled
 from tacpipe.store.records import Provenance, RecordingEntry, Shard, StoredResult
 from tacpipe.store.store import Object, Store
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 VERSION = 1
 BYTES = "bytes"  # name of the attached raw bytes, which are stored if a driver could not decode all of them
@@ -178,8 +176,6 @@ def _store_shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatch
 
 def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader) -> bool:
     """Return whether a shard equals the expected batches bit by bit."""
-    import pyarrow as pa
-
     if not stored.schema.equals(expected.schema):
         return False
     uncompared: list[pa.RecordBatch] = []  # batches of the shard that are not compared yet
@@ -199,8 +195,6 @@ def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader)
 
 def _equal_tables(stored: pa.Table, expected: pa.Table) -> bool:
     """Return whether two tables are equal bit by bit; NaN equals NaN."""
-    import pyarrow as pa
-
     for field, *columns in zip(expected.schema, stored.columns, expected.columns, strict=True):
         if pa.types.is_floating(field.type):
             left, right = (column.to_numpy().view(f"u{field.type.bit_width // 8}") for column in columns)

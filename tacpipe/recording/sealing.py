@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pyarrow as pa
 
 from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
+from tacpipe.io.spill import Piece, Spill
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, LinkReader, StreamFault
 from tacpipe.recording.rig import Rig
@@ -16,11 +19,6 @@ from tacpipe.recording.spool_folders import COMPLETED
 from tacpipe.recording.station import LOST, OPENED, OVERRUN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.io.spill import Piece, Spill
 
 UNCERTAIN = "t_uncertain_ns"  # column that exists only if this program was delayed
 PIECE_BYTES = 1 << 22  # bytes of samples that are moved to disk together
@@ -48,8 +46,6 @@ class Decoded:
 
     def add(self, batch: Batch) -> None:
         """Add samples. Raises Arrow's error, and adds nothing, if a value does not fit its column."""
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         if not len(batch):
@@ -81,8 +77,6 @@ class Decoded:
 
     def batches(self, stamping: Stamping, *, uncertain: bool) -> pa.RecordBatchReader:
         """Return the samples with UTC timestamps in batches. If ``uncertain``, a column has their possible delays."""
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         stamps = [schema.time_field()]
@@ -103,8 +97,6 @@ class Decoded:
 
     def _spill_tables(self) -> None:
         """Move the tables in memory to the spill file."""
-        import pyarrow as pa
-
         if self._in_memory:
             self._pieces.append(self._spill.add(pa.concat_tables(self._in_memory).combine_chunks()))
             self._in_memory, self._bytes = [], 0
@@ -144,8 +136,6 @@ class Sealed:
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
     """Decode all streams of a spool; return them by name."""
-    from tacpipe.io.spill import Spill
-
     end_ns = max((tally.last_ns for tally in spooled.tallied().values()), default=0)
     spill = Spill(MEMORY_BYTES)
     return {name: seal_stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
@@ -157,8 +147,6 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
     ``end_ns`` is the arrival of the last byte of any stream: a stream that ended long before gets an event. Samples are
     moved to ``spill``, or to a new one, which lives as long as the result.
     """
-    from tacpipe.io.spill import Spill
-
     sensor = rig.streams[name].sensor
     decoded, stalls = Decoded(sensor.fields(), spill or Spill(MEMORY_BYTES)), Stalls()
     tally = _decode_blocks(_joined_blocks(spooled, name), sensor, decoded, stalls)
@@ -287,8 +275,6 @@ def _cut_off_events(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tupl
 
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     """Return the table of the events of all streams, sorted by time."""
-    import pyarrow as pa
-
     from tacpipe.channels import schema
 
     rows = sorted((event, name) for name, stream in sealed.items() for event in stream.events)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.comparison.runs import RecordingOutcome
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.report.blocks import Fold, ImageRow, Picture, fold, notes
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Recording
 
 SHOWN = 4  # number of right and of wrong predictions with frames
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, TaskReport, grouped
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import JsonObject
 from tacpipe.metrics import headline, pairing
@@ -33,9 +33,6 @@ from tacpipe.report.blocks import (
 )
 from tacpipe.report.blocks import Row as Line
 from tacpipe.report.context import SIMULATED, Context, median_run, provenance_blocks
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 
 def metrics_sentence(results: Sequence[Dataset]) -> str:

@@ -12,18 +12,16 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.sensors import number_texts, sensor
 from tacpipe.sensors.byte_framer import ByteFramer, LineFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TAIL = b"\r\n"
 CHANNELS = 4  # number of channels per magnetometer
@@ -50,8 +48,6 @@ class AnySkin(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01_temperature``, ``taxel01_x``, … of each magnetometer: float32, °C and µT."""
-        import pyarrow as pa
-
         fields = []
         flux = sensor.taxel_fields(self.magnetometers, pa.float32(), "uT", axes="xyz")
         for number, name in enumerate(sensor.numbered_names("taxel", self.magnetometers), start=1):

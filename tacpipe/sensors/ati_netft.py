@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bytes, Floats
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 REQUEST = struct.Struct(">HHI")  # 0x1234, command, records
 MAGIC = 0x1234
@@ -67,8 +65,6 @@ class AtiNetFT(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``status`` (uint32, 0: no error) and the load: int32 counts, or N and N m if counts per unit are set."""
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         status = pa.field("status", pa.uint32(), metadata={"unit": "1", "quantity": "status"})

@@ -15,9 +15,10 @@ A frame is one row. Its time is that of the frame; ``offset_ns`` of each field i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import Bools, Bytes, Ints
@@ -27,9 +28,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MARKER = b"BT"
 HEADER = 5  # size in bytes: marker, fingers, counter

@@ -12,9 +12,10 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import TextFramer
@@ -22,9 +23,6 @@ from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Options, Samples, Sensor
 from tacpipe.video.encoding import jpeg_format
 from tacpipe.video.images import read_shape
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MAGIC = b"TPCF"
 FRAME, SETTINGS = b"F", b"S"

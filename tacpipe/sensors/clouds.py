@@ -10,9 +10,10 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bytes, Float32s
 from tacpipe.clouds import point_files
@@ -21,9 +22,6 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 NAME = Path("a cloud")  # name in errors, because the file name is not known here
 CACHED = 4  # number of cached clouds, because the framer and the decoder parse the same clouds

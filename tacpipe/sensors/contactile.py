@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, Bytes, Float32s, Int64s
@@ -26,9 +27,6 @@ from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.pts import FreshFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 RATES = (100, 250, 500, 1000)
 COUNTER = 1 << 32
@@ -68,8 +66,6 @@ class Contactile(Sensor):
         ``sensor1_slip`` (uint8: 0 detection off, 1 on, 2 on and the reference pillar is loaded), ``sensor1_friction`` and
         ``sensor1_grip_force_n`` (float32).
         """
-        import pyarrow as pa
-
         sensors = [(f"sensor{number}", {"sensor": str(number)}) for number in range(1, self.sensors + 1)]
         pillars = [
             (f"{name}_pillar{pillar}", {**layout, "taxel": str(pillar)})
@@ -222,8 +218,6 @@ class _ContactileController(Device):
 
 def _vector_fields(prefix: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:
     """Return the float32 fields of a vector: x, y and z, with ``layout`` in their metadata."""
-    import pyarrow as pa
-
     suffix = unit.replace(" ", "_").lower()
     return [
         pa.field(

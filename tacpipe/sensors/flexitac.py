@@ -9,18 +9,16 @@ Source: the package flexitac 0.3.1 (MIT) and the firmware that comes with it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bytes
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Samples, Sensor, SerialLine
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MARKER = b"\xaa\x55"
 MAX_TAXELS = 4094  # limited by `Framing.max_size`
@@ -47,8 +45,6 @@ class FlexiTac(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01``, …, row by row: uint8 counts of an ADC that increase with pressure."""
-        import pyarrow as pa
-
         return sensor.grid_fields(self.rows, self.columns, pa.uint8(), "count")
 
     def framer(self) -> Framer:

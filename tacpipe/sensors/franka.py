@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
@@ -19,9 +20,6 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 VERSION = 10
 HEADER = struct.Struct("<III")  # command, number of the message, size in bytes including this header
@@ -85,8 +83,6 @@ class Franka(Sensor):
         load. Floats are converted to float64, as for other arms. The load acts on the stiffness frame and is in the
         base frame. Each error is one bit, in the order of the interface.
         """
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         angles, speeds = schema.joint_fields(JOINTS)

@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Int64s
 from tacpipe.errors import UsageError
@@ -28,9 +29,6 @@ from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MAX_SIZE = 4096  # maximum size of a frame in bytes
 
@@ -138,8 +136,6 @@ class Generic(layout.DescribedSensor):
 
     def fields(self) -> list[pa.Field]:
         """Return one field per channel, in the order of the numbers, with unit, quantity, taxel and axis."""
-        import pyarrow as pa
-
         return [
             pa.field(name, pa.from_numpy_dtype(span.dtype), metadata=metadata)
             for span in self._channels
@@ -333,8 +329,6 @@ class RawHid(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``analog01`` to ``analog12``, uint16 counts."""
-        import pyarrow as pa
-
         return [
             pa.field(f"analog{reading:02d}", pa.uint16(), metadata={"unit": "count", "quantity": "analog"})
             for reading in range(1, READINGS + 1)

@@ -18,16 +18,14 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
+from typing import Any, ClassVar, TypedDict
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 VERSION = 1
 MAX_GRASPS, MAX_POINTS = 1000, 1_000_000  # maximum numbers of grasps, and of points, per request
@@ -51,7 +49,6 @@ class GraspRequests(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return the fields of request number, grasp number, both contact points, and the wrist's rotation row by row."""
-        import pyarrow as pa
 
         def number(name: str) -> pa.Field:
             metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}

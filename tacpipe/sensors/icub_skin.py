@@ -15,17 +15,15 @@ is incomplete. A frame is one scan: the concatenation of its CAN frames, 13 byte
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes, Int64s, Times
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TORN = "torn"  # a scan with missing CAN frames
 CAN = 13  # bytes of a CAN frame: identifier (4), length (1), data (8)
@@ -206,8 +204,6 @@ class IcubSkin(Sensor):
 
         The two thermal pads of a triangle have the quantity ``temperature``.
         """
-        import pyarrow as pa
-
         taxels = [
             pa.field(
                 f"triangle{triangle + 1}_taxel{taxel:02d}",

@@ -10,9 +10,10 @@ from __future__ import annotations
 import functools
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Indices
 from tacpipe.errors import UsageError
@@ -20,9 +21,6 @@ from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, SerialLine
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TAIL = b"\x00\x00\x80\x7f"
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -79,8 +77,6 @@ class JustFloat(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return one float32 field per channel, with the option's names or ``taxel01``, …."""
-        import pyarrow as pa
-
         metadata = {"unit": self.unit, "quantity": self.quantity}
         if self.names:
             return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]

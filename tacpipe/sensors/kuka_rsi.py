@@ -13,10 +13,11 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 from xml.etree import ElementTree
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats, Indices
 from tacpipe.errors import UsageError
@@ -25,10 +26,6 @@ from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Device, Samples, Sensor
 from tacpipe.signals import kinematics
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 CYCLES_MS = (4, 12)
 FRAME, AXES = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{axis}" for axis in range(1, 7))

@@ -13,16 +13,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from tacpipe.arrays import AnyArray, Bools, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, number_texts, sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 Type = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -373,9 +372,6 @@ class Parser:
 
 def _fill_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Array, Bools | None]:
     """Replace the texts of missing values by 0, and return a mask (text,) of them, or None if there are none."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     flags = pc.is_in(texts, value_set=pa.array([text.decode() for text in missing], pa.string()))
     absent = flags.to_numpy(zero_copy_only=False)
     return (pc.if_else(flags, "0", texts), absent) if absent.any() else (texts, None)

@@ -20,9 +20,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.errors import UsageError
@@ -33,9 +34,6 @@ from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
 from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineNumbers, LineSum, Parser, line_sums
 from tacpipe.sensors.line_layout import LineSequence as Counter
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, LocalAddress, Samples
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MAX_SIZE = 1 << 16  # maximum size of a line in bytes
 ParsedBatch = tuple[Int64s | None, LineNumbers]  # indices of lines with a sample (None: all), and their numbers
@@ -175,8 +173,6 @@ class Lines(DescribedSensor):
 
     def fields(self) -> list[pa.Field]:
         """Return one field per channel, in the order of the columns, with unit, quantity, taxel and axis."""
-        import pyarrow as pa
-
         cells = [self._cells[position] for position in self._channels]
         return [pa.field(cell.name, pa.from_numpy_dtype(cell.kind), metadata=dict(cell.metadata)) for cell in cells]
 

@@ -12,9 +12,10 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
@@ -23,9 +24,6 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Options, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 DESCRIPTION, NUMBERS, TEXTS = b"D", b"S", b"T"
 HEAD = struct.Struct("<cdI")  # kind, correction in s (NaN before the first measurement), number of samples
@@ -76,8 +74,6 @@ class Lsl(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return one field per channel, and ``lsl_correction_s``, the offset from the sender's to this computer's clock."""
-        import pyarrow as pa
-
         kind = pa.string() if self._is_text else pa.from_numpy_dtype(self._dtype.newbyteorder("="))
         fields = []
         for channel in self.channels:

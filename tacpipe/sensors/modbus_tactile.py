@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import DeviceError
@@ -20,9 +21,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 READ_REGISTERS, WRITE_REGISTER, INFO, PRESSURES = 0x03, 0x06, 0x41, 0x42  # functions
 REFUSED = 0x80  # bit of the function in a reply that reports an error
@@ -54,8 +52,6 @@ class ModbusTactile(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01``, …, uint16, in mN or counts."""
-        import pyarrow as pa
-
         return sensor.taxel_fields(self.points, pa.uint16(), self.unit)
 
     @property

@@ -10,15 +10,12 @@ import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Int64s
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 SPACES = b" \t\r\n"
 BLANKS = b" \t"  # characters allowed around a separator
@@ -130,8 +127,6 @@ def _mark_offsets(text: bytes) -> Int64s:
 
 def _slice(text: bytes, edges: Int64s) -> pa.Array | None:
     """Return the parts of a text between ``edges`` (part + 1,), or None if it is too long for 32-bit offsets."""
-    import pyarrow as pa
-
     if len(text) > MAX_BYTES:
         return None
     return pa.StringArray.from_buffers(len(edges) - 1, pa.py_buffer(edges.astype(np.int32)), pa.py_buffer(text))
@@ -144,8 +139,6 @@ def select_range(texts: pa.Array, rows: range) -> pa.Array:
 
 def select(texts: pa.Array, rows: Int64s) -> pa.Array:
     """Return the texts in these rows."""
-    import pyarrow as pa
-
     return texts.take(pa.Array.from_buffers(pa.int64(), len(rows), [None, pa.py_buffer(rows)]))
 
 
@@ -158,8 +151,6 @@ def concatenate(texts: pa.Array) -> bytes:
 
 def with_content(texts: pa.Array, text: bytes) -> pa.Array:
     """Return texts of the same lengths with the content of ``text``, whose length is the total."""
-    import pyarrow as pa
-
     _, offsets, _ = texts.buffers()
     ends = np.frombuffer(offsets, np.int32)[texts.offset : texts.offset + len(texts) + 1]
     return pa.StringArray.from_buffers(len(texts), pa.py_buffer((ends - ends[0]).astype(np.int32)), pa.py_buffer(text))
@@ -180,8 +171,6 @@ def cast(texts: pa.Array, kind: np.dtype[Any]) -> AnyArray | None:
 
     The result is a view of pyarrow's buffer, because its own conversion would import pandas.
     """
-    import pyarrow as pa
-
     try:
         numbers = texts.cast(kind.name)
     except pa.ArrowInvalid:

@@ -8,9 +8,10 @@ counts per newton. Source: DAQ communication protocol, from the package optoforc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import UsageError
@@ -18,9 +19,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 LENGTHS = {3: 0x0A, 6: 0x10, 12: 0x1C}  # last byte of the header by number of axes
 SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # rate in Hz -> byte of the command
@@ -55,8 +53,6 @@ class OptoForce(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``status`` (uint16, bits as in the DAQ's manual) and the axes (int16 counts)."""
-        import pyarrow as pa
-
         status = pa.field("status", pa.uint16(), metadata={"unit": "1", "quantity": "status"})
         if self.axes == 6:
             names = [(f"{kind}_{axis}", kind, axis) for kind in ("force", "torque") for axis in "xyz"]

@@ -13,9 +13,10 @@ import functools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes, Indices
 from tacpipe.errors import DeviceError, UsageError
@@ -24,9 +25,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import lrc
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 REQUEST, REPLY, PUSH = b"\x55\xaa\x00", b"\xaa\x55\x00", b"\xaa\x56\x00"
 READ_FUNCTION, WRITE_FUNCTION, CALIBRATE_FUNCTION = 0x03, 0x10, 0x17
@@ -191,8 +189,6 @@ class Paxini(Sensor):
 
         ``thumb_tip_force_x``, … and ``thumb_tip_taxel01_x``, … are int8, ``thumb_tip_force_z``, … uint8, in 0.1 N.
         """
-        import pyarrow as pa
-
         fields = [pa.field("status", pa.uint8(), metadata={"unit": "1", "quantity": "status"})]
         for axes, kind in (("xy", pa.int8()), ("z", pa.uint8())):
             for module, count in self.points.items():

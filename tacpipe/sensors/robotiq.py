@@ -11,9 +11,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Indices, Int64s
 from tacpipe.errors import UsageError
@@ -21,9 +22,6 @@ from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 START, HEADER = 0x9A, 4
 READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
@@ -251,8 +249,6 @@ def _columns(groups: tuple[tuple[Key, ...], ...], layout: Layout) -> Columns | N
 
 def _fields(part: str, finger: int) -> list[pa.Field]:
     """Return the fields of a part of a finger. Fingers are counted from 1."""
-    import pyarrow as pa
-
     prefix, number = f"finger{finger}_", str(finger)
     if part == "static":
         return sensor.grid_fields(ROWS, COLUMNS, pa.uint16(), "count", prefix=prefix, finger=number)

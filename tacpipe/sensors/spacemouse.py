@@ -13,18 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.channels.schema import AXES
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import MALFORMED, Account, Chunks, Framer, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Frames, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TRANSLATION, ROTATION, BUTTONS, BATTERY = 1, 2, 3, 23
 # size of a report in bytes, including its number
@@ -52,8 +50,6 @@ class SpaceMouse(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return six axes, ``translation_x`` to ``rotation_z`` (int16 counts), and ``buttons`` (uint32, one bit each)."""
-        import pyarrow as pa
-
         axes = [
             pa.field(
                 f"{kind}_{axis}", pa.int16(), metadata={"unit": "count", "quantity": "deflection", "component": axis}

@@ -13,9 +13,10 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
@@ -24,9 +25,6 @@ from tacpipe.plugins.stage import Values
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key or a path such as pose.x or q.0, with its unit
 RESERVED = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
@@ -63,8 +61,6 @@ class Tap(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``event`` and ``json`` (text), and the numbers (float64); or the columns of `Grasp.table` for grasps."""
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         if self.grasp:

@@ -9,9 +9,10 @@ Distances are not converted, including codes: 0 is too near, 1 could not be meas
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import UsageError
@@ -19,9 +20,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc8
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MARKER = b"\x54"
 SIZE = 4
@@ -47,8 +45,6 @@ class TeraRanger(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``distance``, uint16 mm."""
-        import pyarrow as pa
-
         return [pa.field("distance", pa.uint16(), metadata={"unit": "mm", "quantity": "proximity"})]
 
     def framer(self) -> Framer:

@@ -23,9 +23,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.errors import DeviceError, UsageError
@@ -33,9 +34,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum8
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MARKER = b"\x59\x59"
 SIZE = 9
@@ -83,8 +81,6 @@ class TfMini(Sensor):
 
         For Plus and S, ``temperature`` (uint16; °C = count / 8 − 256); for the original, ``mode`` and ``spare`` (uint8).
         """
-        import pyarrow as pa
-
         fields = [
             pa.field("distance", pa.uint16(), metadata={"unit": self.unit, "quantity": "proximity"}),
             pa.field("strength", pa.uint16(), metadata={"unit": "count", "quantity": "signal_strength"}),

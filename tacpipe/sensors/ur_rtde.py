@@ -11,9 +11,10 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Ints
 from tacpipe.errors import DeviceError, UsageError
@@ -21,9 +22,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 WIRE = {  # numpy type and number of elements, by RTDE type
     "BOOL": ("u1", 1),
@@ -96,8 +94,6 @@ def type_of(output: str) -> str | None:
 
 def fields_of(output: str) -> list[pa.Field]:
     """Return the fields of an output: the common fields of arms, or its name in lower case with a number per element."""
-    import pyarrow as pa
-
     from tacpipe.channels import schema
 
     if output == POSE:

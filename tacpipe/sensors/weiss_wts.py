@@ -17,9 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Bytes, Counts, Int64s
 from tacpipe.errors import DeviceError, UsageError
@@ -27,9 +28,6 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, grid_fields
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MARKER = b"\xaa\xaa\xaa"
 HEADER = 6  # size in bytes: marker, number, size
@@ -74,8 +72,6 @@ class WeissWts(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01``, … row by row, uint16 counts."""
-        import pyarrow as pa
-
         return grid_fields(self.rows, self.columns, pa.uint16(), "count")
 
     def framer(self) -> Framer:

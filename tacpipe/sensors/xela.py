@@ -15,18 +15,16 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Counts
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 COUNT = "[0-9a-fA-F]{1,4}"
 DIGITS = 4  # hexadecimal digits of a count with leading zeros
@@ -60,8 +58,6 @@ class Xela(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01_x``, … (uint16 counts), and with ``forces`` also ``taxel01_force_x_n``, … (float32, N)."""
-        import pyarrow as pa
-
         from tacpipe.channels import schema
 
         counts = schema.uskin_fields(self.taxels)

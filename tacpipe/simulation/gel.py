@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bytes, Floats, Times
 from tacpipe.channels import schema
@@ -23,9 +24,6 @@ from tacpipe.simulation import faults, handling, pick_and_move
 from tacpipe.simulation.pick_and_move import PickRig, PickScene
 from tacpipe.video.encoding import ENCODED_BY, encode_images, jpeg_format
 from tacpipe.video.files import packet_stream
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 FINGERS = ("gel1", "gel2")
 HEIGHT_PX, WIDTH_PX = 240, 320

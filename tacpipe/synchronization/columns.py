@@ -5,17 +5,16 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
+from tacpipe.io.spill import MappedArrays
+from tacpipe.signals.kinematics import SignContinuation
 from tacpipe.synchronization import streams
 from tacpipe.synchronization.streams import TimedStream
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
-    from tacpipe.io.spill import MappedArrays
-    from tacpipe.signals.kinematics import SignContinuation
 
 MEDIAN_NS = 10_000_000  # half the width of a median filter, whose full width contains eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
@@ -65,8 +64,6 @@ class GridColumns:
 
     def gaps(self) -> Bools:
         """Return the mask of grid points (grid,) in a gap."""
-        import numpy as np
-
         mask = np.zeros(len(self._grid_ns), dtype=bool)
         for points in self._blocks():
             mask[points] = _gap_mask(self._stream, self._grid_ns[points], self._gap_ns, hold_values=self._hold_values)
@@ -74,8 +71,6 @@ class GridColumns:
 
     def extend_look_ahead(self, ahead_ns: Times) -> None:
         """Increase ``ahead_ns`` (grid,) to the time from each point to the arrival of the last sample used for it."""
-        import numpy as np
-
         for points in self._blocks():
             exact = None if self._exact is None else self._exact[points]
             stream_ns = _look_ahead_ns(self._stream, self._grid_ns[points], exact)
@@ -117,7 +112,6 @@ def _channels(
     ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated. ``signs`` continues
     the signs of quaternions from the previous call. Raises `TacpipeError` if a quaternion lacks a component.
     """
-    from tacpipe.signals.kinematics import SignContinuation
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
@@ -180,8 +174,6 @@ def _interpolate_samples(
 
     ``signs`` continues the sign of a quaternion from the previous call.
     """
-    import numpy as np
-
     from tacpipe.signals.resampling import linear, median_around, slerp
 
     t_ns = stream.t_ns[rows]
@@ -194,8 +186,6 @@ def _interpolate_samples(
 
 
 def _to_column(field: pa.Field, values: Floats) -> GridColumn:
-    import numpy as np
-
     return field, np.ascontiguousarray(values, dtype=field.type.to_pandas_dtype())
 
 
@@ -204,8 +194,6 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
 
     ``exact`` are the rows whose times are the grid points, or None.
     """
-    import numpy as np
-
     from tacpipe.signals.resampling import nearest_rows
 
     rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
@@ -215,8 +203,6 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
 
 def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) -> Times:
     """Return the time (grid,) in ns from each point to the arrival of its last sample, or 0 if that arrived before."""
-    import numpy as np
-
     rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
     if exact is None and any(streams.method(stream.columns.schema, name) == "median" for name in stream.channels):
         rows = np.maximum(rows, np.searchsorted(stream.t_ns, grid_ns + MEDIAN_NS, side="right") - 1)
@@ -245,8 +231,6 @@ def _gap_mask(stream: TimedStream, grid_ns: Times, gap_ns: int, *, hold_values: 
 
 def _masks(name: str, repeated: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:
     """Return the fields and values of a stream's masks ``held`` and ``gap`` and of the distances ``dt_ns``."""
-    import pyarrow as pa
-
     mask = {"unit": "1", "quantity": "mask", "stream": name}
     return [
         (pa.field(f"{name}_held", pa.bool_(), metadata=mask), repeated),

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
 
 from tacpipe import printable
+from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times, from_arrow
 from tacpipe.channels import arm
 from tacpipe.channels.streams import layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError
+from tacpipe.io.columns import Columns
+from tacpipe.io.spill import MappedArrays
 from tacpipe.plugins.stage import Attribute
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times
-    from tacpipe.io.columns import Columns
-    from tacpipe.io.spill import MappedArrays
-
 
 TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
@@ -35,8 +33,6 @@ def channel_names(schema: pa.Schema) -> list[str]:
 
 def method(schema: pa.Schema, name: str) -> str:
     """Return the interpolation of a channel: nearest, linear, median, or slerp with the name of its quaternion."""
-    import pyarrow as pa
-
     field = schema.field(name)
     metadata = field.metadata or {}
     quantity = metadata.get(b"quantity", b"").decode()
@@ -64,8 +60,6 @@ def quaternion_order(stream: str, fields: Sequence[pa.Field]) -> list[int]:
 
 def interpolated_type(kind: pa.DataType) -> pa.DataType:
     """Return the type of interpolated values: unchanged for floats, float32 for up to 16-bit integers, else float64."""
-    import pyarrow as pa
-
     if pa.types.is_floating(kind):
         return kind
     return pa.float32() if kind.bit_width <= 16 else pa.float64()
@@ -73,8 +67,6 @@ def interpolated_type(kind: pa.DataType) -> pa.DataType:
 
 def grid_field(stream: str, channel: pa.Field, interpolation: str, kind: pa.DataType | None = None) -> pa.Field:
     """Return the field ``<stream>_<column>`` of a channel on the grid, with stream and interpolation as metadata."""
-    import pyarrow as pa
-
     metadata = {**(channel.metadata or {}), b"stream": stream.encode(), b"interpolation": interpolation.encode()}
     return pa.field(grid_name(stream, channel.name), kind or channel.type, metadata=metadata)
 
@@ -105,8 +97,6 @@ class Wraps(NamedTuple):
 
     def undo(self, counts: AnyArray, first: int) -> Int32s:
         """Return ``counts`` (time,) of the rows from ``first`` as int32 without wraps."""
-        import numpy as np
-
         from tacpipe.signals.repairs import RANGE
 
         turns = self.turns[self.rows.searchsorted(np.arange(first, first + len(counts)), side="right")]
@@ -133,15 +123,11 @@ class TimedStream:
 
     def field(self, name: str) -> pa.Field:
         """Return the field of a channel. An unwrapped channel has the type after unwrapping."""
-        import pyarrow as pa
-
         channel = self.columns.schema.field(name)
         return channel.with_type(pa.int32()) if name in self.wraps else channel
 
     def values(self, name: str) -> AnyArray:
         """Return a numeric channel (time,)."""
-        from tacpipe.arrays import from_arrow
-
         counts = from_arrow(self.columns.column(name))
         return self.wraps[name].undo(counts, self.first_row) if name in self.wraps else counts
 
@@ -165,8 +151,6 @@ def is_signal(columns: Columns) -> bool:
 
 def may_be_signal(schema: pa.Schema) -> bool:
     """Return whether a stream with this schema and more than one row is a signal, as in `is_signal`."""
-    import pyarrow as pa
-
     channels = [field for field in schema if field.name not in ("t_ns", UNCERTAIN)]
     if any(pa.types.is_binary(field.type) for field in channels):
         return False
@@ -205,9 +189,6 @@ def _convert_device_times(
 
     Raises `TacpipeError` if device times are missing or no integers, or cannot be fitted.
     """
-    import pyarrow as pa
-
-    from tacpipe.arrays import from_arrow
     from tacpipe.signals.clocks import fit_clock, host_times
 
     column = columns.column(DEVICE)
@@ -230,8 +211,6 @@ def _convert_device_times(
 
 def _certain(columns: Columns) -> Bools | None:
     """Return a mask (time,) of the rows whose arrival was not delayed, or None if none was delayed."""
-    from tacpipe.arrays import from_arrow
-
     if UNCERTAIN not in columns.column_names:
         return None
     certain: Bools = from_arrow(columns.column(UNCERTAIN)) == 0
@@ -240,10 +219,6 @@ def _certain(columns: Columns) -> Bools | None:
 
 def _stamps(recording: str, stream: str, columns: Columns, storage: MappedArrays) -> Int64s:
     """Return the arrival times (time,) in ns of a stream. Raises `TacpipeError` if there are none, or they decrease."""
-    import numpy as np
-
-    from tacpipe.arrays import from_arrow
-
     if "t_ns" not in columns.column_names or not columns.num_rows:
         raise TacpipeError(
             f"Recording {recording}: stream {stream!r} has no rows with t_ns. Exclude the recording with "
@@ -269,8 +244,6 @@ def _stamps(recording: str, stream: str, columns: Columns, storage: MappedArrays
 
 def unwrap_counts(stream: TimedStream) -> TimedStream:
     """Return a stream whose 16-bit tactile counts are unwrapped."""
-    import pyarrow as pa
-
     names = []
     for kind in stream.columns.schema:
         tactile = (kind.metadata or {}).get(b"quantity") == b"tactile"
@@ -281,8 +254,6 @@ def unwrap_counts(stream: TimedStream) -> TimedStream:
 
 def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
     """Return the counter wraps of each channel that has any. Channels with empty rows are not checked."""
-    import numpy as np
-
     from tacpipe.arrays import from_arrow, is_numeric
     from tacpipe.signals.repairs import HALF, count_wraps
 
@@ -311,8 +282,6 @@ def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
 
 def _repeated_rows(columns: Columns, storage: MappedArrays) -> Bools:
     """Return a mask (time,) of rows that repeat the previous row in all channels except labels, which are often constant."""
-    from tacpipe.arrays import from_arrow
-
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
     repeated: Bools = storage.empty((columns.num_rows,), bool)
     repeated[:] = bool(names)
@@ -366,8 +335,6 @@ def grid(
     online the last sample of a stream is unknown, and equal times become one point. The results are stored in ``storage``.
     Raises `TacpipeError` if there are no points.
     """
-    import numpy as np
-
     from tacpipe.signals.resampling import uniform_offsets
 
     first_ns = max(int(stream.t_ns[0]) for stream in streams.values())
@@ -411,7 +378,6 @@ def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s, storage: MappedArray
     ``grid_rows`` (grid,) are the rows of a stream with the same clock as the grid, which may repeat times. The result is
     kept in ``storage``.
     """
-    import numpy as np
 
     def shifted(block: slice) -> Int64s:
         return np.asarray(grid_rows[block] + (t_ns.searchsorted(grid_ns[0]) - grid_rows[0]))

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import arm
 from tacpipe.channels.arm import METRES, ORIENTATION, POSITION
 from tacpipe.channels.schema import field_metadata
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 TIME = "t_ns"
 # quantities
@@ -100,8 +97,6 @@ def short_names(fields: Sequence[pa.Field]) -> tuple[str, ...]:
 
 def _is_drawn(field: pa.Field, about: Mapping[str, str]) -> bool:
     """Return whether a column is drawn as a curve: a number that is neither a clock nor of an undrawn quantity."""
-    import pyarrow as pa
-
     is_number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
     is_clock = field.name == TIME or field.name.startswith("t_") or field.name in ("seq", "device_seq")
     return is_number and not is_clock and about.get("quantity", "") not in _UNDRAWN_QUANTITIES

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
@@ -15,9 +15,6 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.signals.resampling import linear
 from tacpipe.traces.curves import TIME, matrix
 from tacpipe.traces.taxels import Taxels
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Times
 from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import GAP, gaps_before
 from tacpipe.traces.curves import TIME
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 _VALUE_NAMES = {"phase": {-1: "", 0: "slide", 1: ""}}  # names of the values of label columns
 _UNSET = ("", "0", "-1", "False", "None", "nan")  # values of a label that are not drawn

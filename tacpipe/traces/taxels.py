@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import arm, places
 from tacpipe.channels.schema import field_metadata
 from tacpipe.signals.contact import rest_level
 from tacpipe.traces.curves import TIME, matrix
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 REST_S = 0.2  # duration at the start whose median is the level without load, if no segmentation stored a level
 SCALE_QUANTILE = 0.995  # quantile for the end of a scale, so that a single wrong reading does not darken all others

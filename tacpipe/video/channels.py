@@ -6,20 +6,17 @@ A row depends on the frames up to it only, so a recording and a live session giv
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bytes, Float32s
 from tacpipe.errors import TacpipeError
 from tacpipe.video.decoding import GREY, cell_means, open_decoder, padded_packet
 from tacpipe.video.encoding import RGB
+from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
 from tacpipe.video.stream import PACKET, VideoFormat
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.video.markers import MarkerTracker
 
 COLOURS = ("red", "green", "blue")
 CLOCKS = ("t_ns", "t_device_ns", "seq")  # columns that a stream of channels has from its stream of frames
@@ -50,8 +47,6 @@ class DifferenceChannels:
 
     def fields(self) -> list[pa.Field]:
         """Return the fields ``taxel0101_red`` …, named by row and column from 1 and colour, as float32 grey levels."""
-        import pyarrow as pa
-
         return [
             pa.field(
                 f"taxel{row:02d}{column:02d}_{colour}",
@@ -84,8 +79,6 @@ class MarkerChannels:
 
     def fields(self) -> list[pa.Field]:
         """Return the fields ``taxel0101_x``, ``taxel0101_y`` …, float32 px or mm, and ``detected_ratio``."""
-        import pyarrow as pa
-
         unit = "mm" if self._pitch_mm else "px"
         displacements = [
             pa.field(
@@ -103,8 +96,6 @@ class MarkerChannels:
 
         Raises `TacpipeError` if the first frame has no grid of markers.
         """
-        from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
-
         if self._tracker is None:
             use_one_thread()  # a stage uses one core per recording
             grid = find_grid(image, self._rows, self._columns)
@@ -167,8 +158,6 @@ class LiveChannels:
 
         Raises the errors of the channels' ``values``.
         """
-        import pyarrow as pa
-
         rows: list[int] = []
         values: list[AnyFloats] = []
         packets = frames.column(PACKET)
@@ -184,6 +173,4 @@ class LiveChannels:
 
 def channels_schema(frames: pa.Schema, channels: FrameChannels) -> pa.Schema:
     """Return the schema of the channels of a stream of frames, with its clocks."""
-    import pyarrow as pa
-
     return pa.schema([*(frames.field(name) for name in CLOCKS if name in frames.names), *channels.fields()])

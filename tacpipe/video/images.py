@@ -9,18 +9,16 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, ArrayType, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import plain
 from tacpipe.video.encoding import MICROSECOND
 from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, MAX_SIDE_PX, PACKET, PTS, VideoFormat
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 START, END = b"\xff\xd8", b"\xff\xd9"  # first and last bytes of a JPEG image
 END_BYTES = 4096  # maximum number of bytes with which a camera pads an image
@@ -153,8 +151,6 @@ def frames_from_images(
     value has the raw pixels of an image. Other columns and rows stay. ``place`` names the stream in errors. Raises
     `TacpipeError`, also while rows are read, for an image of another kind or size than the first.
     """
-    import pyarrow as pa
-
     name = _image_column(rows.schema)
     if name is None:
         return rows
@@ -178,8 +174,6 @@ def frames_from_images(
 
 def _image_column(schema: pa.Schema) -> str | None:
     """Return the name of a stream's only column of images; None if there is not exactly one, or the stream has packets."""
-    import pyarrow as pa
-
     names = [
         field.name
         for field in schema
@@ -207,8 +201,6 @@ def _packet_batches(
 
     Raises `TacpipeError` as `_expect_alike` does.
     """
-    import pyarrow as pa
-
     first_ns, last_pts, row = None, -1, 0
     for batch in batches:
         if not batch.num_rows:

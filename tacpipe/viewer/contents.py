@@ -6,20 +6,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bytes, Float32s, Floats, Times
 from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
+from tacpipe.datasets.dataset import Recording
 from tacpipe.datasets.intervals import all_intervals
 from tacpipe.datasets.overview import split_tables
 from tacpipe.formats.arrays.tree import picture_encoding
+from tacpipe.io.columns import Columns
 from tacpipe.plugins.stage import Attribute, ParamValue
 from tacpipe.printable import plain
 from tacpipe.signals import contact
+from tacpipe.store.records import Step
 from tacpipe.traces import curves, spans, taxels
 from tacpipe.traces import predictions as forecasts
 from tacpipe.traces.curves import TIME, Curves, Path
@@ -29,13 +32,6 @@ from tacpipe.traces.taxels import Taxels
 from tacpipe.video.decoding import jpeg_images, read_frames
 from tacpipe.video.stream import BATCH_ROWS, PACKET, read_format
 from tacpipe.viewer.markers import MarkerTrack, track_markers
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.io.columns import Columns
-    from tacpipe.store.records import Step
 
 # quantities by priority
 QUANTITY_PRIORITY = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
@@ -249,8 +245,6 @@ def _split_contacts(contents: DrawnContents, chain: Sequence[Step]) -> DrawnCont
 
 def _subsample(stored: Columns) -> pa.Table:
     """Return some rows of a long stream, chosen as in `for_picture`, and the first second, without columns of bytes."""
-    import pyarrow as pa
-
     names = [channel.name for channel in stored.schema if not str(channel.type).endswith("binary")]
     chosen: list[pa.Table] = []
     rest_values: dict[str, float] = {}

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Floats, Times
 from tacpipe.channels.schema import field_metadata
+from tacpipe.datasets.dataset import Recording
+from tacpipe.store.records import Step
 from tacpipe.traces.curves import TIME
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.store.records import Step
 
 STAGE = "extract.markers"
 AXES = ("x", "y")

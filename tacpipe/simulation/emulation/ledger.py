@@ -7,9 +7,11 @@ from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.sensors.byte_framer import ByteFramer
@@ -17,9 +19,6 @@ from tacpipe.sensors.sensor import Frames, Samples, Sensor
 from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.byte_faults import CAUSES, SentItem, split_frames
 from tacpipe.simulation.emulation.source import Sampled
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 def decode_frames(sensor: Sensor, frames: Frames) -> Samples:
@@ -176,8 +175,6 @@ class Ledger:
 
     def table(self) -> pa.Table:
         """Return the entries as a table."""
-        import pyarrow as pa
-
         columns = {name: pa.array(self.column(name)) for name in ("due_ns", "sent_ns", "number", "size", "source")}
         columns["cause"] = pa.array([CAUSES[code] for code in self._cause])
         columns["invisible"] = pa.array(self.column("invisible").astype(bool))
@@ -185,8 +182,6 @@ class Ledger:
 
     def write(self, folder: Path) -> None:
         """Write ``NAME.parquet`` with the entries and ``NAME.json`` with the events and the changed bytes."""
-        import pyarrow.parquet as pq
-
         folder.mkdir(parents=True, exist_ok=True)
         pq.write_table(self.table(), folder / f"{self.name}.parquet")
         content = {

@@ -6,17 +6,14 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.simulation.emulation.world import World
 from tacpipe.simulation.mechanics import GRAVITY_M_S2
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 WIDTH_M = 0.03  # width of a pad along both axes
 SIGMA_M = 0.005  # standard deviation of the Gaussian that distributes the pressure

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
+from typing import Any, Literal, NotRequired, TypedDict
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
 from tacpipe.metrics import pairing
+from tacpipe.metrics.calibration import ConfidenceBin
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 from tacpipe.tasks.material.params import KEY, StoredNaming
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.metrics.calibration import ConfidenceBin
 
 TASK = "material"
 CHANCE = "chance"
@@ -253,8 +250,6 @@ def label_text(label: Attribute) -> str:
 
 def label_field(name: str, values: AnyArray, quantity: str) -> tuple[pa.Field, list[Any]]:
     """Return a column of classes and its values: int32 for whole numbers, otherwise text; unknown classes are null."""
-    import pyarrow as pa
-
     metadata = {"quantity": quantity}
     if values.dtype.kind in "iu":
         return pa.field(name, pa.int32(), metadata=metadata), values.tolist()

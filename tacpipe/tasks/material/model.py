@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 import pyarrow as pa
@@ -16,9 +16,6 @@ from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS, latent_columns, score_columns
 from tacpipe.tasks.recordings import open_for_model
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 def predict(

@@ -5,22 +5,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
 from tacpipe.channels.streams import missing_channel_error
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed
 from tacpipe.tasks.material.headline import NUMBERS, UNKNOWN, Naming
 from tacpipe.tasks.material.params import StoredLayout
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Dataset, Recording
 
 STREAM = "slide"
 TACTILE = "tactile"

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tacpipe.arrays import Bools, Times
+from tacpipe.datasets.dataset import Recording
 from tacpipe.datasets.intervals import intervals_of
 from tacpipe.signals.runs import runs
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Recording
 
 COLUMNS = ("slip", "slip_slip", "gt_slip")  # columns of stages, synchronized label streams and the simulator
 # columns of `segment contacts` and `segment losses`, and of the simulator; negative without contact

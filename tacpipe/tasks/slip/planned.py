@@ -6,20 +6,15 @@ plan is sampled at the row and at `POINTS` times after it. Accelerations are dif
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats, Times
+from tacpipe.datasets.dataset import Recording
+from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory, PosePlan
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.slip.features import EPSILON, NAMES
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Recording
-    from tacpipe.live.decoding import BatchColumns
 
 STEP_NS, POINTS = 20_000_000, 50  # times after a row at which a plan is sampled: one second
 SMALLEST_STEP_NS = 10_000_000  # time between two points of a plan below which the later one is left out

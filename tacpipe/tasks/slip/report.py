@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, TaskReport
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report.blocks import NONE, Cell, Fold, fixed, fold, notes, table
+from tacpipe.report.context import Context
 from tacpipe.tasks.slip.evaluation import EVENTS, MODEL, WINDOWS, EvaluatedSlips, brier_measure
 from tacpipe.tasks.slip.metrics import PARTS, ObjectEstimate
-
-if TYPE_CHECKING:
-    from tacpipe.report.context import Context
 
 ALARM_HEADS = {
     "minutes": "minutes of stable contact",

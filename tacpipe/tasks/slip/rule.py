@@ -11,22 +11,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 import tacpipe
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
 from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
 from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Model, Recording
 from tacpipe.errors import TacpipeError
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Model, Recording
-    from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
+from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
 
 STEPS = (1, 3, 5, 10)  # steps ahead of the forecasts
 SMALLEST_LOAD = 1e-3  # minimum divisor, as a fraction of the largest load of a recording
@@ -79,8 +76,6 @@ class RuleScorer:
 
     def forecasts(self, recording: Recording) -> pa.Table:
         """Return the forecasts of a recording, with the metadata of their columns, which `ForwardModel.predict` lacks."""
-        import pyarrow as pa
-
         from tacpipe.tasks.recordings import OpenedChain, open_for_model
         from tacpipe.tasks.task import PredictionRequest
 

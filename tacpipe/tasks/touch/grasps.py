@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +11,9 @@ from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud, require_columns
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.overview import describe_streams
 from tacpipe.errors import TacpipeError
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Recording
-
 
 STREAMS = ("cloud", "grasp")
 READING = "reading"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import numpy as np
 import pyarrow as pa
@@ -23,9 +23,6 @@ from tacpipe.tasks.touch.evaluation import readings_table, simulated
 from tacpipe.tasks.touch.headline import PREDICTIONS
 from tacpipe.tasks.touch.predictor import CONFIG, PredictedReading, Predictor
 from tacpipe.tasks.touch.quantiles import FILE, ReadingQuantiles
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 def predict(

@@ -10,7 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import pyarrow as pa
 
 from tacpipe.channels.streams import finger_stream
 from tacpipe.io import Json
@@ -23,9 +24,6 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
 from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, SlideSplitter, rows_after, rows_until
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 GAP_NS = 50_000_000  # age of the finger's newest sample above which its stream counts as silent
 MAX_DURATION_NS = 120_000_000_000  # maximum duration of a recording, whose rows are in memory until it ends
@@ -232,8 +230,6 @@ class MaterialEngine(Engine):
 
     def _fetch(self, *, final: bool) -> None:
         """Append new samples to the stored tables, unless no prediction is possible, and count late ones."""
-        import pyarrow as pa
-
         assert self._offset_ns is not None
         for name, decoder in self._decoders.items():
             batches = decoder.last() if final else decoder.batches()

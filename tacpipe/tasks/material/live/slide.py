@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Float32s
 from tacpipe.channels.streams import EVENTS, finger_stream
@@ -29,10 +30,7 @@ from tacpipe.tasks.material.live.messages import MATERIAL, MIN_SEEN
 from tacpipe.tasks.material.slides import STREAM, describe_difference
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     Tables = Mapping[str, pa.Table]
-    import pyarrow as pa
 
 SLIDES = "segment.slides"
 ENDED_NS = 200_000_000  # time without a row of the slide after which it has ended
@@ -296,8 +294,6 @@ def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[R
 
 def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
     """Return the table of predictions, with a probability of each class in ``names``; "unknown" without a prediction."""
-    import pyarrow as pa
-
     answers = [answer for *_, answer in rows]
     probabilities = np.array(
         [np.full(len(names), np.nan) if answer.probabilities is None else answer.probabilities for answer in answers],

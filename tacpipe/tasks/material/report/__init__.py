@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import Kind, RecordingOutcome, TaskReport
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, SmallPrint
 from tacpipe.report.context import Context
@@ -14,9 +14,6 @@ from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.report import figures, joint, methods, probabilities, scores
 from tacpipe.tasks.material.report.methods import ComparedRun, Method, question_on, runs_on, sensor_title, sensors_of
 from tacpipe.tasks.material.report.predictions import LAST, LEVEL, MODEL
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 
 class MaterialReport(TaskReport):

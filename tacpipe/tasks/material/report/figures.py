@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Ints
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, counted, fold, form, listed
 from tacpipe.report.charts import Curve
@@ -27,10 +27,6 @@ from tacpipe.tasks.material.report.methods import (
 )
 from tacpipe.tasks.material.report.predictions import MODEL, NOTHING, SlidePredictions
 from tacpipe.tasks.material.report.scores import accuracy
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Recording
-
 
 MAX_PAIRS = 3  # maximum number of pairs of materials in a sentence
 CONFUSION_NOTE = (

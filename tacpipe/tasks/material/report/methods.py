@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings, marks
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
@@ -28,10 +28,6 @@ from tacpipe.tasks.material.report.predictions import (
     SWAPPED,
     SlidePredictions,
 )
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that names do not mark

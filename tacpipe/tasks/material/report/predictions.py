@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
@@ -14,10 +15,6 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.tasks.material.headline import NUMBERS, Naming
 from tacpipe.tasks.material.params import MaterialConfig
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"

@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.metrics import regression
 from tacpipe.report import blocks, charts, context
 from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold
@@ -30,10 +30,6 @@ from tacpipe.tasks.touch.report.methods import (
     predicted_targets,
 )
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Recording
-
 
 PRESSURES = ("pdc_th", "pdc_mf")
 MAX_GRASPS = 800  # maximum number of grasps in a figure

@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from tacpipe.arrays import Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import PredictorErrors, Question, Settings, distinct_names, marks
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.io import Scalar
 from tacpipe.metrics import regression
 from tacpipe.plugins import params as params_of
@@ -25,10 +25,6 @@ from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN,
 from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, kind_of
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import GraspPredictions
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
-
 
 USUAL = ("split", "simulated")  # settings that are not part of a method's name, but of the question
 _NO_METHOD = ("seed", "run_label", "baselines")  # may differ between runs of one method; the label is shown as split

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Spread, spread
+from tacpipe.datasets.dataset import Recording
 from tacpipe.metrics import regression
 from tacpipe.metrics.intervals import Estimate
 from tacpipe.tasks.touch.headline import CONSTANT, GRASPS, MODEL, TRUE
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from tacpipe.datasets.dataset import Recording
-
 
 Touch = Mapping[str, Floats]  # target -> (grasp, value), device counts
 
