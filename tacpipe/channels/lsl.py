@@ -177,8 +177,7 @@ def nanoseconds(seconds: Floats) -> Int64s:
     [1500000000, 41037236252649]
     """
     whole_s = np.floor(seconds)
-    total_ns: Int64s = whole_s.astype(np.int64) * 10**9 + np.rint((seconds - whole_s) * 1e9).astype(np.int64)
-    return total_ns
+    return whole_s.astype(np.int64) * 10**9 + np.rint((seconds - whole_s) * 1e9).astype(np.int64)
 
 
 def identifiers(labels: Sequence[str]) -> list[str]:

@@ -147,5 +147,4 @@ def local_points(points_m: AnyFloats, grasp: Grasp) -> Floats:
 
     g1 is at (0, -opening / 2, 0), g2 at (0, opening / 2, 0).
     """
-    local_m: Floats = (points_m - grasp.middle_m) @ wrist_axes(grasp)
-    return local_m
+    return (points_m - grasp.middle_m) @ wrist_axes(grasp)

@@ -66,8 +66,7 @@ def reduce_image(image: Bytes) -> Bytes:
         raise TacpipeError(
             f"The image has {width} x {height} pixels. The autoencoder needs {COLUMNS} x {ROWS} or more."
         )
-    means: Bytes = np.rint(cell_means(image, ROWS, COLUMNS)).astype(np.uint8)
-    return means
+    return np.rint(cell_means(image, ROWS, COLUMNS)).astype(np.uint8)
 
 
 def fit(train: Bytes, held_out: Bytes, schedule: loop.Schedule, workspace: Path, components: int) -> bytes:

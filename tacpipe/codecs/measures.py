@@ -211,8 +211,7 @@ class Moments:
     @property
     def centred_triangle(self) -> AnyFloats:
         """The triangular factor (channel, channel) of the centred rows."""
-        triangle: AnyFloats = self._triangle[1:, 1:] * self.varies
-        return triangle
+        return self._triangle[1:, 1:] * self.varies
 
     def mean_and_scale(self, representation: str) -> tuple[AnyFloats, AnyFloats]:
         """Return mean and scale of each channel, both (channel,), as `tacpipe.codecs.measures.mean_and_scale`.
@@ -244,5 +243,4 @@ class Moments:
 
 def _triangle(rows: AnyFloats) -> AnyFloats:
     """Return the triangular factor R (column, column) of a QR decomposition of rows (row, column)."""
-    triangle: AnyFloats = np.asarray(np.linalg.qr(rows, mode="r"))
-    return triangle
+    return np.asarray(np.linalg.qr(rows, mode="r"))

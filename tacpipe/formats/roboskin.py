@@ -211,8 +211,7 @@ def _read_slide(path: Path, index: int) -> Float32s:
         if is_time(evidence, -1, ALONG_TIME):
             return slide
         if is_time(unscramble(evidence), -1, ALONG_TIME):
-            values: Float32s = unscramble(slide)
-            return values
+            return unscramble(slide)
     raise TacpipeError(
         f"{path}, slide {index}: neither as it stands nor unscrambled is its last axis time. Neighbours along it "
         f"correlate by {lag_one(slide, -1):.2f} and {lag_one(unscramble(slide), -1):.2f}; along time it is {ALONG_TIME} or "

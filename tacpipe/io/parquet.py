@@ -54,8 +54,7 @@ def to_parquet(table: pa.Table) -> bytes:
     # table's memory
     sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
     write(table, sink)
-    content: bytes = sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
-    return content
+    return sink.getvalue() if isinstance(sink, io.BytesIO) else sink.getvalue().to_pybytes()
 
 
 def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:

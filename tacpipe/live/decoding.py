@@ -100,8 +100,7 @@ class BatchColumns:
         if number < len(self._first):
             return self._first[number]
         ((block, _, places),) = self._find_columns((number,))
-        column: AnyArray = self._blocks[block][:, places[0]]
-        return column
+        return self._blocks[block][:, places[0]]
 
     def columns_of(self, numbers: tuple[int, ...]) -> Floats:
         """Return columns of values (sample, column) by index."""

@@ -168,8 +168,7 @@ def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
 
 def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
     """Return the logarithm of the error ratio, 1 - `skill`, bounded below; NaN if the baseline's error is 0."""
-    ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), MIN_RATIO))
-    return ratio
+    return np.log(np.maximum(1 - skill(model, baseline), MIN_RATIO))
 
 
 def weighted_log_ratios(model: AnyFloats, baseline: AnyFloats) -> tuple[AnyFloats, AnyFloats]:

@@ -74,8 +74,7 @@ class AffineMap:
 
     def __call__(self, features: AnyFloats) -> AnyFloats:
         """Return the increments (window, step x channel), in counts, of features (window, feature)."""
-        increments: AnyFloats = (features - self.centre) @ self.weight + self.bias
-        return increments
+        return (features - self.centre) @ self.weight + self.bias
 
     def to_tensors(self, name: str) -> dict[str, AnyFloats]:
         """Return its arrays, with names that start with ``name``."""
@@ -316,8 +315,7 @@ def _features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
 
 def _damping(phi: AnyFloats, horizon: int) -> AnyFloats:
     """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, shape (phi, step)."""
-    total: AnyFloats = np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
-    return total
+    return np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
 
 
 def _mean(arrays: WindowArray) -> AnyFloats:

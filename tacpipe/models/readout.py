@@ -103,8 +103,7 @@ class Readout:
             raise TacpipeError(
                 f"Features of {features.shape} do not fit the readout; (slide, {len(self.centre)}) was fitted."
             )
-        scores: AnyFloats = (features - self.centre) @ self.weight + self.bias
-        return scores
+        return (features - self.centre) @ self.weight + self.bias
 
     def predict(self, features: AnyFloats) -> Int32s:
         """Return the class with the highest score of each slide, (slide,)."""
@@ -223,8 +222,7 @@ class Level:
             raise TacpipeError(
                 f"Slides of {x.shape} do not fit the mean levels; (slide, time, {len(self.centre)}) was fitted."
             )
-        scores: AnyFloats = (_levels(x) - self.centre) @ self.weight + self.bias
-        return scores
+        return (_levels(x) - self.centre) @ self.weight + self.bias
 
     def predict(self, x: AnyFloats) -> Int32s:
         """Return the class with the highest score of each slide, (slide,)."""
@@ -373,5 +371,4 @@ def _statistics(x: AnyFloats) -> Float32s:
 def _append_profile(root: Floats) -> Floats:
     """Append the mean, spread and quantiles of all channels at each moment to roots (slide, time, channel)."""
     across = [root.mean(axis=2), root.std(axis=2), *np.quantile(root, ACROSS_CHANNELS, axis=2)]
-    wide: Floats = np.concatenate([root, np.stack(across, axis=2)], axis=2)
-    return wide
+    return np.concatenate([root, np.stack(across, axis=2)], axis=2)

@@ -39,8 +39,7 @@ Kind = type[Any]
 
 def task(kind: Any) -> str | None:
     """Return the task whose architectures extend exactly the class ``kind``, or None for other params."""
-    task_name: str | None = vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
-    return task_name
+    return vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
 
 
 @functools.cache

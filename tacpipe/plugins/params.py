@@ -343,5 +343,4 @@ def _join_annotations(annotations: Sequence[Any]) -> Any:
 
 def presets_of(kind: Kind | None) -> Presets:
     """Return the values of each preset of a kind of params, by its name."""
-    presets: Presets = getattr(kind, "PRESETS", {})
-    return presets
+    return getattr(kind, "PRESETS", {})

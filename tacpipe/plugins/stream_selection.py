@@ -103,8 +103,7 @@ class _Narrowed:
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         """Return a stream, as `tacpipe.datasets.dataset.Recording.table` does."""
         if self._columns is None or stream:
-            table: pa.Table = self._recording.table(stream, columns)
-            return table
+            return self._recording.table(stream, columns)
         return self._columns.read(self._columns.column_names if columns is None else columns)
 
     def columns(self, stream: str = "") -> Columns:

@@ -81,8 +81,7 @@ class CounterUnroller:
 
     def _signed_difference(self, delta: Int64s) -> Int64s:
         half = self.modulus // 2
-        signed: Int64s = (delta + half) % self.modulus - half
-        return signed
+        return (delta + half) % self.modulus - half
 
     def _unroll_after_outage(
         self, raw: int, at_ns: int, last_raw: int, last_seq: int, last_ns: int

@@ -97,8 +97,7 @@ class AnySkin(Sensor):
 
 
 def _floats(frames: Bytes) -> Float32s:
-    floats: Float32s = np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
-    return floats
+    return np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
 
 
 @functools.lru_cache(maxsize=4)  # the framer and the decoder read the same lines

@@ -122,8 +122,7 @@ def with_parity(bits: Ints) -> NDArray[np.uint8]:
 def _is_odd(data: Bytes) -> Bools:
     folded = data ^ (data >> 4)
     folded = folded ^ (folded >> 2)
-    odd: Bools = ((folded ^ (folded >> 1)) & 1).astype(bool)
-    return odd
+    return ((folded ^ (folded >> 1)) & 1).astype(bool)
 
 
 def _is_whole(frames: Bytes) -> Bools:

@@ -210,8 +210,7 @@ def message_size(data: bytes) -> int:
 
 def _matrices(states: NDArray[np.void], name: str) -> Float32s:
     """Return an end-effector pose in the base frame as matrices (frame, 4, 4)."""
-    poses: Float32s = states[name].reshape(-1, 4, 4).transpose(0, 2, 1)
-    return poses
+    return states[name].reshape(-1, 4, 4).transpose(0, 2, 1)
 
 
 def _poses(states: NDArray[np.void], name: str) -> Floats:

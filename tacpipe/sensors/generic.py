@@ -162,8 +162,7 @@ class Generic(layout.DescribedSensor):
     def _sizes(self, heads: Bytes) -> Int64s:
         assert self.length is not None
         declared = self._spans[self.length.number].read(heads)[:, 0]
-        sizes: Int64s = np.minimum(declared.astype(np.uint64), MAX_SIZE + 1).astype(np.int64) + self.length.plus
-        return sizes
+        return np.minimum(declared.astype(np.uint64), MAX_SIZE + 1).astype(np.int64) + self.length.plus
 
     def _are_valid(self, frames: Bytes) -> Bools:
         """Return a mask (frame,) of the frames (frame, byte) with the right checksum and constant numbers.

@@ -137,8 +137,7 @@ class _Bridge(Device):
 
 
 def _floats(frames: Bytes) -> Float32s:
-    floats: Float32s = np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
-    return floats
+    return np.ascontiguousarray(frames[:, : -len(TAIL)]).view("<f4").astype(np.float32, copy=False)
 
 
 def _is_finite(frames: Bytes) -> Bools:

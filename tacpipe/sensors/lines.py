@@ -189,10 +189,7 @@ class Lines(DescribedSensor):
         return self._parse(lines) is not None
 
     def _parse(self, lines: Sequence[bytes]) -> ParsedBatch | None:
-        read: ParsedBatch | None = _parse(
-            self._parser, tuple(map(bytes.strip, lines)) if self.packets else tuple(lines)
-        )
-        return read
+        return _parse(self._parser, tuple(map(bytes.strip, lines)) if self.packets else tuple(lines))
 
     def decode(self, frames: Frames) -> Samples:
         """Return the channels (line, channel) in one block per type, with sequence and clock. Comments have no sample.

@@ -263,8 +263,7 @@ def _fields(part: str, finger: int) -> list[pa.Field]:
 
 def _sizes(heads: Bytes) -> Int64s:
     """Return the sizes of frames (frame,) from their headers (frame, 4); 0 for an unknown command."""
-    sizes: Int64s = IS_COMMAND.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
-    return sizes
+    return IS_COMMAND.take(heads[:, 2]) * (heads[:, 3].astype(np.int64) + HEADER)
 
 
 def _structure(frame: bytes) -> Structure:

@@ -247,8 +247,7 @@ def _reply_finder(number: int, *, refusable: bool = False) -> Callable[[bytes], 
 
 
 def _words(frames: Bytes) -> Counts:
-    words: Counts = np.ascontiguousarray(frames[:, CELLS_AT:-2]).view("<u2")
-    return words
+    return np.ascontiguousarray(frames[:, CELLS_AT:-2]).view("<u2")
 
 
 def _sizes(head: Bytes) -> Int64s:

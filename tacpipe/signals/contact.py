@@ -38,8 +38,7 @@ def rest_level(values: AnyArray, t_ns: Times, rest_s: float) -> Floats:
     if not len(t_ns):
         raise TacpipeError(NO_ROWS)
     rows = int(np.searchsorted(t_ns, t_ns[0] + round(rest_s * 1e9), side="right"))
-    level: Floats = np.median(values[: max(rows, 1)], axis=0).astype(np.float64)
-    return level
+    return np.median(values[: max(rows, 1)], axis=0).astype(np.float64)
 
 
 def lowest_rows(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:

@@ -91,8 +91,7 @@ def _medians(values: AnyArray, before: int, after: int) -> Floats:
         return np.zeros(0)
     padded = np.pad(values.astype(np.float64), (before, after), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, before + after + 1)  # (time, rows)
-    medians: Floats = np.median(windows, axis=1)
-    return medians
+    return np.median(windows, axis=1)
 
 
 def envelope(t_ns: Times, values: AnyArray, points: int) -> tuple[Times, Floats]:

@@ -297,5 +297,4 @@ def path_speed(t_ns: Times, position_m: AnyFloats, span_s: float = 0.02) -> Floa
     for block in _blocks(len(t_ns)):
         distance_m[block] = np.linalg.norm(position_m[last[block]] - position_m[first[block]], axis=1)
     duration_s = (t_ns[last] - t_ns[first]) / 1e9
-    speed: Floats = np.divide(distance_m, duration_s, out=np.zeros(len(t_ns)), where=duration_s > 0)
-    return speed
+    return np.divide(distance_m, duration_s, out=np.zeros(len(t_ns)), where=duration_s > 0)

@@ -45,8 +45,7 @@ def uniform_offsets(first: int, count: int, rate_hz: float) -> Times:
     """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e9):
         raise TacpipeError(f"The rate of a grid is {rate_hz} Hz; it must be above 0 and at most 1e9 Hz.")
-    offsets_ns: Times = np.rint(np.arange(first, first + count, dtype=np.float64) * 1e9 / rate_hz).astype(np.int64)
-    return offsets_ns
+    return np.rint(np.arange(first, first + count, dtype=np.float64) * 1e9 / rate_hz).astype(np.int64)
 
 
 def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
@@ -139,8 +138,7 @@ def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
 
     It is the online counterpart of `in_gap`, before the sample that ends a gap arrives.
     """
-    overdue: Bools = grid_ns - newest_ns > gap_ns
-    return overdue
+    return grid_ns - newest_ns > gap_ns
 
 
 def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -> Floats:

@@ -25,8 +25,7 @@ def latch(on: Bools, off: Bools) -> Bools:
     [False, True, True, False]
     """
     last_change = np.maximum.accumulate(np.where(on | off, np.arange(len(on)), -1))
-    state: Bools = (last_change >= 0) & on[last_change]
-    return state
+    return (last_change >= 0) & on[last_change]
 
 
 def in_long_runs(state: Bools, rows: int) -> Bools:
@@ -43,8 +42,7 @@ def in_long_runs_online(state: Bools, rows: int) -> Bools:
     """Return a mask of rows up to which ``state`` (time,) was True for at least ``rows`` rows: `in_long_runs`, causally."""
     count = np.arange(1, len(state) + 1)
     last_off = np.maximum.accumulate(np.where(state, 0, count))  # rows up to the last False
-    in_run: Bools = state & (count - last_off >= rows)
-    return in_run
+    return state & (count - last_off >= rows)
 
 
 GAP = 1.5  # longest time between consecutive rows of a run, as a multiple of the median

@@ -66,8 +66,7 @@ def fill_missing(readings: AnyArray) -> Floats:
     if not finite.any():
         return np.zeros(len(values))
     rows = np.maximum.accumulate(np.where(finite, np.arange(len(values)), int(finite.argmax())))
-    values_by_row: Floats = values[rows]
-    return values_by_row
+    return values[rows]
 
 
 def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
@@ -75,8 +74,7 @@ def rate(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:
     if len(readings) < 2:
         return np.zeros(len(readings))
     smooth = butterworth(cutoff_hz, rate_hz).both_ways(median(readings, MEDIAN_ROWS))
-    slope: Floats = np.gradient(smooth) * rate_hz
-    return slope
+    return np.gradient(smooth) * rate_hz
 
 
 def rate_online(readings: Floats, rate_hz: float, cutoff_hz: float) -> Floats:

@@ -61,8 +61,7 @@ def principal_curvatures(bending: Floats, normal: Floats) -> Floats:
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     tangents = np.stack([first, np.cross(normal, first)], axis=2)  # (point, xyz, tangent)
-    curvatures: Floats = np.linalg.eigvalsh(np.swapaxes(tangents, 1, 2) @ bending @ tangents)
-    return curvatures
+    return np.linalg.eigvalsh(np.swapaxes(tangents, 1, 2) @ bending @ tangents)
 
 
 @dataclass(frozen=True)

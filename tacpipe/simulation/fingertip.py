@@ -87,5 +87,4 @@ def tare(counts: Floats) -> Counts:
 
 def to_counts(counts: Floats) -> Counts:
     """Convert tared counts to the values that the sensor sends: absolute, rounded, within 16 bits."""
-    rounded: Counts = np.rint(np.abs(counts)).clip(0, 65_535).astype(np.uint16)
-    return rounded
+    return np.rint(np.abs(counts)).clip(0, 65_535).astype(np.uint16)

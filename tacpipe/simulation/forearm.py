@@ -47,13 +47,11 @@ def leans(patch_m: Floats) -> Floats:
 
     It is positive in front of the patch.
     """
-    lean: Floats = LEAN * np.tanh((ALONG_M - patch_m[:, :1]) / SIGMA_M)
-    return lean
+    return LEAN * np.tanh((ALONG_M - patch_m[:, :1]) / SIGMA_M)
 
 
 def simulate_taxels(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Float32s:
     """Return the logged taxels (time, taxel) for a signal: with noise and drift, less the dead zone, and clipped."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
-    counts: Float32s = (signal + noise_scale * noise - DEAD_COUNT).clip(0, MAX_COUNT).astype(np.float32)
-    return counts
+    return (signal + noise_scale * noise - DEAD_COUNT).clip(0, MAX_COUNT).astype(np.float32)

@@ -110,8 +110,7 @@ class GelCamera:
             patch *= (1 - MARKER_DARKNESS * covered)[..., None]
         first = number * NOISE_STEP % (len(self._noise) - self._size)
         image += self._noise[first : first + self._size].reshape(image.shape)
-        pixels: Bytes = np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8)
-        return pixels
+        return np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8)
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,7 @@ class HeldObject:
     @property
     def limit_n(self) -> Floats:
         """The largest static friction force of both fingers in the xz plane, 2 mu_s N (time,)."""
-        limit: Floats = 2 * self.friction * self.grip_n
-        return limit
+        return 2 * self.friction * self.grip_n
 
     def demand_n(self, acceleration_m_s2: Floats, borne: Floats | float = 1.0) -> Floats:
         """Return the force (time, axis) in the hand frame that moves the object with the hand.

@@ -45,8 +45,7 @@ FLOOR_COUNT = 544.0  # minimum reading, which is reached at 24.5 mm
 def proximity_readings(up_m: Floats, noise_scale: float, rng: np.random.Generator) -> NDArray[np.int16]:
     """Return the counts for an object with the relative displacement ``up_m`` (time,), negative for downward slip."""
     level = REST_COUNT + COUNT_MM * 1000 * up_m + NOISE_COUNT * noise_scale * rng.normal(size=len(up_m))
-    counts: NDArray[np.int16] = np.rint(level).clip(FLOOR_COUNT, np.iinfo(np.int16).max).astype(np.int16)
-    return counts
+    return np.rint(level).clip(FLOOR_COUNT, np.iinfo(np.int16).max).astype(np.int16)
 
 
 START_NS = 1_600_000_000_000_000_000  # UTC time of the first trial; the next ones start minutes later
@@ -308,8 +307,7 @@ def interpolation(scene: PickScene, true_ns: Times) -> Any:
 
     def at(values: Floats) -> Floats:
         weight = fraction if values.ndim == 1 else fraction[:, None]
-        interpolated: Floats = values[rows - 1] * (1 - weight) + values[rows] * weight
-        return interpolated
+        return values[rows - 1] * (1 - weight) + values[rows] * weight
 
     return at
 
@@ -415,5 +413,4 @@ def _attributes(scene: PickScene, index: int, start_ns: int, rig: PickRig) -> di
 def _ease(progress: Floats) -> Floats:
     """Return a smooth ramp from 0 to 1 as ``progress`` goes from 0 to 1."""
     clipped = np.clip(progress, 0.0, 1.0)
-    eased: Floats = clipped**2 * (3 - 2 * clipped)
-    return eased
+    return clipped**2 * (3 - 2 * clipped)

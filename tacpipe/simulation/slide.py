@@ -160,8 +160,7 @@ def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig(
     contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
     pressed_n = scene.force_n[:, None] * (1 + scene.material.friction * lean)
-    counts: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
-    return counts
+    return factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
 
 
 def sensitivity(scene: SlideScene) -> tuple[Floats, Floats, Floats, float]:

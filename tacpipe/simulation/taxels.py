@@ -143,11 +143,9 @@ def draw_errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.ra
     steps_s = np.diff(at_s, prepend=at_s[:1])
     drift = np.cumsum(rng.normal(0, 1.0, shape) * np.sqrt(steps_s)[:, None, None], axis=0) * DRIFT_COUNT
     noise = rng.normal(0, 1.0, shape) * NOISE_COUNT
-    off: Floats = noise * noise_scale + drift * drift_scale
-    return off
+    return noise * noise_scale + drift * drift_scale
 
 
 def digitise(counts: Floats) -> Counts:
     """Return the device's counts (time, channel) for counts (time, taxel, axis): rounded, clipped to 16 bits."""
-    rounded: Counts = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
-    return rounded
+    return np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)

@@ -89,8 +89,7 @@ def transmission(number_per_m: Floats, aperture_m: float) -> Floats:
     >>> transmission(np.array([0.0, 125.0, 250.0]), 0.0018).round(3).tolist()
     [1.0, 0.368, 0.018]
     """
-    fraction: Floats = np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
-    return fraction
+    return np.exp(-2 * (np.pi * aperture_m * number_per_m) ** 2)
 
 
 def contact_force(surface: Waves, position_m: Floats, aperture_m: float) -> Floats:

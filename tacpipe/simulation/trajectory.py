@@ -99,8 +99,7 @@ def rest(duration_s: float) -> Trajectory:
 def draw_controlled_path(rows: int, first: int, rng: np.random.Generator) -> Floats:
     """Return a path of the controlled protocol that starts in row ``first`` (time, axis), in metres from the start."""
     acceleration = smooth(_trapezoids(rows, first, rng))
-    path: Floats = np.cumsum(np.cumsum(acceleration, axis=0), axis=0) / RATE_HZ**2
-    return path
+    return np.cumsum(np.cumsum(acceleration, axis=0), axis=0) / RATE_HZ**2
 
 
 def draw_kinaesthetic_path(rows: int, first: int, rng: np.random.Generator) -> Floats:
@@ -128,8 +127,7 @@ def draw_kinaesthetic_path(rows: int, first: int, rng: np.random.Generator) -> F
 
 def minimum_jerk(progress: Floats) -> Floats:
     """Return the fraction of the distance of a minimum-jerk movement after a fraction ``progress`` of its duration."""
-    fraction: Floats = progress**3 * (10 - 15 * progress + 6 * progress**2)
-    return fraction
+    return progress**3 * (10 - 15 * progress + 6 * progress**2)
 
 
 def smooth(acceleration: Floats) -> Floats:

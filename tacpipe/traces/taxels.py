@@ -154,8 +154,7 @@ def bin_peaks(t_ns: Times, values: Floats, start_ns: int, stop_ns: int, bins: in
     ends = occupied[-1] + spacing
     latest = np.maximum.accumulate(np.where(np.isin(np.arange(bins), occupied), np.arange(bins), -1))
     covered = (latest >= 0) & (np.arange(bins) < ends)
-    repeated: Floats = np.where(covered[:, None], peaks[np.maximum(latest, 0)], np.nan)
-    return repeated
+    return np.where(covered[:, None], peaks[np.maximum(latest, 0)], np.nan)
 
 
 def image(colours: AnyArray, rows: int) -> AnyArray:

@@ -233,8 +233,7 @@ class ZarrTree:
         with _archive(self.path) as archive:
             if archive.getinfo(name).file_size > MAX_METADATA_BYTES:
                 raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MAX_METADATA_BYTES:,} bytes.")
-            content: bytes = archive.read(name)
-            return content
+            return archive.read(name)
 
     @contextlib.contextmanager
     def _store(self) -> Iterator[Any]:
@@ -361,8 +360,7 @@ def _parse_dtype(metadata: ZarrMetadata) -> np.dtype[Any]:
     if kind == "|O":
         filter_names = [entry.get("id") for entry in metadata.get("filters") or ()]
         return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in filter_names else {})
-    dtype: np.dtype[Any] = np.dtype([tuple(entry) for entry in kind] if isinstance(kind, list) else kind)
-    return dtype
+    return np.dtype([tuple(entry) for entry in kind] if isinstance(kind, list) else kind)
 
 
 def _codec_names(metadata: ZarrMetadata) -> Iterator[Any]:

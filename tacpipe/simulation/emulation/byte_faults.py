@@ -328,5 +328,4 @@ class ClockSteps:
             self.moments_ns.append(moment)
             step_ns = self._step_ns if self._rng.random() < 0.5 else -self._step_ns
             self._sums = np.append(self._sums, self._sums[-1] + step_ns)
-        summed: Times = self._sums[np.searchsorted(np.array(self.moments_ns, dtype=np.int64), t_ns, side="left")]
-        return summed
+        return self._sums[np.searchsorted(np.array(self.moments_ns, dtype=np.int64), t_ns, side="left")]

@@ -139,8 +139,7 @@ class Ledger:
         codes = np.array([CODES[cause] for cause in UNHARMED])
         count = len(self)  # same length for all columns; another thread may append meanwhile
         size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
-        rows: Int64s = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
-        return rows
+        return np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
 
     def samples(self, rows: Sequence[int] | Int64s | None = None) -> Samples:
         """Return the samples that a perfect link returns for entries, by default for all `intact_rows`.

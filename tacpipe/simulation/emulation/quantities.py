@@ -303,8 +303,7 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
     if kind.kind in "iu":
         limits = np.iinfo(kind)
         scaled = np.rint(scaled).clip(limits.min, limits.max)
-    column: AnyArray = scaled.astype(kind)
-    return column
+    return scaled.astype(kind)
 
 
 def unit_scale(unit: str) -> float | None:

@@ -49,8 +49,7 @@ def next_due_ns(sample_ns: Times, pace: FramePace, after_ns: int, rng: np.random
     late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(sample_ns))).astype(np.int64)
     arrival_ns = np.maximum(np.maximum.accumulate(sample_ns + late_ns), after_ns)
     burst_ns = round(pace.burst_ms * 1e6)
-    burst_due_ns: Times = -(-arrival_ns // burst_ns) * burst_ns if burst_ns else arrival_ns
-    return burst_due_ns
+    return -(-arrival_ns // burst_ns) * burst_ns if burst_ns else arrival_ns
 
 
 AHEAD_NS = 1_500_000_000  # time by which frames are planned ahead

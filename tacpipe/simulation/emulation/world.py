@@ -202,8 +202,7 @@ def append_return(scene: pick_and_move.PickScene) -> pick_and_move.PickScene:
 
     def fade(values: Floats, fraction: Floats, resting: Any = 0.0) -> Floats:
         last = values[-1] - resting
-        faded: Floats = np.concatenate([values, resting + np.multiply.outer(fraction, last)])
-        return faded
+        return np.concatenate([values, resting + np.multiply.outer(fraction, last)])
 
     path, contact, grasp = scene.path, scene.contact, scene.grasp
     no_slip = np.zeros(rows, dtype=bool)

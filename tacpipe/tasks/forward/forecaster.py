@@ -299,8 +299,7 @@ class Forecaster:
     def features(self, windows: ForecastWindows) -> AnyFloats:
         """Return the predicted features (window, horizon, feature) in the codec's unit."""
         predicted: Tensor = self.model(with_actions(windows, self.actions))
-        features: AnyFloats = predicted.transpose(0, 1).numpy()
-        return features
+        return predicted.transpose(0, 1).numpy()
 
     def decode_counts(self, features: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return counts above rest (window, horizon, channel) for predicted features (window, horizon, feature).
@@ -315,8 +314,7 @@ class Forecaster:
 
     def anchor_levels(self, levels: AnyFloats, last: AnyFloats, last_feature: AnyFloats) -> AnyFloats:
         """Return decoded levels (window, horizon, channel) shifted by the codec's error in the last row."""
-        moved: AnyFloats = levels + (last - self.codec.decode(last_feature))[:, None]
-        return moved
+        return levels + (last - self.codec.decode(last_feature))[:, None]
 
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32.

@@ -273,8 +273,7 @@ class Network:
         if self._trace_network is None:
             return self._forecaster.features(windows)
         predicted: Tensor = self._trace_network(*windows)
-        features: AnyFloats = predicted.transpose(0, 1).numpy()
-        return features
+        return predicted.transpose(0, 1).numpy()
 
 
 class _Parts(nn.Module):

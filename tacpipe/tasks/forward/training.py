@@ -334,8 +334,7 @@ def _reference(part: Sequence[Track]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,), the reference for the signs of all others."""
     for track in part:
         if track.usable.any():
-            quaternion: AnyFloats = track.arm[track.usable.argmax(), tracks.TURNED].astype(np.float64)
-            return quaternion
+            return track.arm[track.usable.argmax(), tracks.TURNED].astype(np.float64)
     return np.array([0.0, 0.0, 0.0, 1.0])
 
 

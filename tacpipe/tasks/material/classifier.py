@@ -362,8 +362,7 @@ class Classifier:
     def partner(self, sensor: str) -> str:
         """Return the sensor whose classifier is exchanged with that of ``sensor``: the next one."""
         names = list(self.layouts)
-        partner: str = names[(names.index(sensor) + 1) % len(names)]
-        return partner
+        return names[(names.index(sensor) + 1) % len(names)]
 
 
 @dataclass(frozen=True)

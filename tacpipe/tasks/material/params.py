@@ -212,8 +212,7 @@ class Estimator(MaterialModelParams, ABC):
 
         By default these are all frames: (slide, time · channel).
         """
-        flat: Float32s = frames.reshape(len(frames), -1)
-        return flat
+        return frames.reshape(len(frames), -1)
 
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of one fitted estimator per sensor."""

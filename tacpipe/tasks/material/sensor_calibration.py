@@ -99,14 +99,13 @@ class ClassDistance:
         plain = (_features(frames, self.patterns) - self.centre) @ self.projection
         scaled, training = plain * self.gain, self.slides * self.gain
         origin = np.zeros((1, plain.shape[1]))
-        scores: Floats = (
+        return (
             _log_distances(scaled @ self.overall, origin)
             + _log_distances(plain, origin) / 2
             - _log_distances(scaled, _means(training, self.labels))
             - self._nearest(_log_distances(scaled, training))
             - self._nearest(_log_distances(plain, self.slides))
         )
-        return scores
 
     def _nearest(self, distances: Floats) -> Floats:
         """Return the minimum by class (slide, class) of the distances to training slides (slide, training slide)."""
@@ -283,7 +282,4 @@ def _log_odds(scores: AnyFloats) -> Floats:
     other_scores = floats.copy()
     np.put_along_axis(other_scores, best, -np.inf, axis=1)
     remainder = logsumexp(other_scores, axis=1)
-    log_odds: Floats = np.take_along_axis(floats, best, axis=1)[:, 0] - np.where(
-        np.isfinite(remainder), remainder, -1e6
-    )
-    return log_odds
+    return np.take_along_axis(floats, best, axis=1)[:, 0] - np.where(np.isfinite(remainder), remainder, -1e6)

@@ -88,8 +88,7 @@ class Area:
         else:
             won = ((objects @ self.wins) * objects).sum(axis=1)
             pairs = (objects @ self.positives) * (objects @ self.negatives)
-        area: Floats = np.where(pairs > 0, won / np.where(pairs > 0, pairs, 1), np.nan)
-        return area
+        return np.where(pairs > 0, won / np.where(pairs > 0, pairs, 1), np.nan)
 
 
 def _wins(slips: AnyFloats, stable: AnyFloats, weights: AnyFloats) -> Floats:

@@ -108,8 +108,7 @@ def fill_missing(values: AnyFloats, before: Floats) -> Floats:
     """
     stacked = np.concatenate([before[None], values])
     places = np.where(np.isnan(stacked), 0, np.arange(len(stacked))[:, None])
-    filled: Floats = np.take_along_axis(stacked, np.maximum.accumulate(places, axis=0), axis=0)[1:]
-    return filled
+    return np.take_along_axis(stacked, np.maximum.accumulate(places, axis=0), axis=0)[1:]
 
 
 @dataclass(frozen=True)

@@ -257,8 +257,7 @@ def _contact_indices(points: Floats, contact_m: float, radius_m: float) -> Indic
 def _random_indices(total: int, count: int, rng: np.random.Generator) -> Indices:
     """Return ``count`` random indices below ``total``; an index repeats only after all have been used."""
     if count <= total:
-        indices: Indices = rng.choice(total, count, replace=False, shuffle=False)
-        return indices
+        return rng.choice(total, count, replace=False, shuffle=False)
     return np.concatenate([np.arange(total), rng.integers(0, total, count - total)])
 
 

@@ -73,8 +73,7 @@ class Targets:
         sign = 1.0 if newest[3:] @ before[3:] >= 0 else -1.0
         two_poses = np.stack([np.concatenate([before[:3], sign * before[3:]]), newest])
         moved = kinematics.difference_velocity(np.array([before_ns, newest_ns]), two_poses[:, :3], two_poses[:, 3:])[1]
-        state: Float32s = np.concatenate([newest, moved]).astype(np.float32)
-        return state
+        return np.concatenate([newest, moved]).astype(np.float32)
 
 
 def facing(state: Float32s, arm: Float32s) -> Float32s:

@@ -191,8 +191,7 @@ def _fresh_rows(runs: Sequence[ComparedRun]) -> pd.DataFrame:
     coverage = read_coverage([run.dataset for run in runs])
     assert coverage is not None, "each run has a coverage file"
     coverage["unit"] = coverage["recording"].where(coverage["known"] | coverage["object"].isna(), coverage["object"])
-    fresh: pd.DataFrame = coverage[~coverage.seen]
-    return fresh
+    return coverage[~coverage.seen]
 
 
 def _coverage_chart(title: str, bands: Bands, level: float) -> Chart:

@@ -133,8 +133,7 @@ def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
     refused_known, refused_unknown = (
         np.searchsorted(np.sort(scores), ends, side="left") / len(scores) for scores in (known_scores, unknown)
     )
-    curve: Floats = np.interp(RATES, refused_known, np.maximum.accumulate(refused_unknown))
-    return curve
+    return np.interp(RATES, refused_known, np.maximum.accumulate(refused_unknown))
 
 
 def _reliability_chart(title: str, method: Method, sensor: str, answers: pd.DataFrame) -> Chart:
