@@ -23,6 +23,7 @@ from typing import Any, ClassVar, TypedDict
 import numpy as np
 import pyarrow as pa
 
+from tacpipe.channels import schema
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -49,15 +50,11 @@ class GraspRequests(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return the fields of request number, grasp number, both contact points, and the wrist's rotation row by row."""
-
-        def number(name: str) -> pa.Field:
-            metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}
-            return pa.field(name, pa.float64(), metadata=metadata)
-
         numbers = [
             pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "plan"}) for name in ("request", "grasp")
         ]
-        return [*numbers, *map(number, (*POINTS, *WRIST))]
+        axes = [schema.float_field(name, "m" if name in POINTS else "1", "plan") for name in (*POINTS, *WRIST)]
+        return [*numbers, *axes]
 
     def accepts(self, packet: bytes) -> bool:
         """Return whether a packet is a request. Any program may send packets to the port."""

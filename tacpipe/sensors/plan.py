@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from tacpipe.channels import schema
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -51,12 +52,9 @@ class Plan(Sensor):
         """Return the planned time of a point in UTC ns, and its pose."""
         import pyarrow as pa
 
-        def number(name: str) -> pa.Field:
-            metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}
-            return pa.field(name, pa.float64(), metadata=metadata)
-
         target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "plan"})
-        return [target, *map(number, POSE)]
+        pose = [schema.float_field(name, "m" if name.endswith("_m") else "1", "plan") for name in POSE]
+        return [target, *pose]
 
     def accepts(self, packet: bytes) -> bool:
         """Return whether a packet is a plan. Any program may send packets to the port."""
