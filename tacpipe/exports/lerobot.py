@@ -138,7 +138,8 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     )
     frame_features = features_of_frames(params, frames.synchronized_columns(all_recordings[0]).select(columns))
     tasks = _tasks(params, all_recordings)
-    lengths = {recording.name: _row_count(parts, recording.name) for recording in all_recordings}
+    tables = {recording.name: parts[recording.name].table(contents.STREAMS) for recording in all_recordings}
+    lengths = {name: int(table["rows"][0].as_py()) for name, table in tables.items()}
     videos = {
         recording.name: {
             camera.name: EpisodeVideo.from_recordings(
@@ -222,10 +223,6 @@ def _has_stream(columns: Columns, stream: str) -> bool:
     from tacpipe.exports import frames
 
     return any(channel.stream == stream for channel in frames.channels(columns))
-
-
-def _row_count(parts: Dataset, name: str) -> int:
-    return int(parts[name].table(contents.STREAMS)["rows"][0].as_py())
 
 
 def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:

@@ -277,17 +277,13 @@ class TaxelwiseForecast(ChangeForecast):
         hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._dropout_mask(hidden)))
         hidden = hidden * self._dropout_mask(hidden)
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
-        is_new = self._novelty(windows)
+        is_new = 3 - 4 * repeats(windows.touch).T  # (window, context): new frames are rare, so they weigh more
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
         inputs = torch.cat([plan, is_new.expand(len(plan), -1, -1)], -1)
         states, _ = lstm.run_layer(self.plan, inputs, self.start(whole)[None])
         steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(is_new)).T[..., None]
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
         return self.to_touch(change.flatten(2), windows)
-
-    def _novelty(self, windows: ForecastWindows) -> Tensor:
-        """Return 3 for new rows and -1 for repeated ones, (window, context): new frames are rare, so they weigh more."""
-        return 3 - 4 * repeats(windows.touch).T
 
     def _split_taxels(self, touch: Tensor) -> Tensor:
         """Return ``touch`` (…, channel) as (…, taxel, axis)."""

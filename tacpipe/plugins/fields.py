@@ -220,7 +220,7 @@ def _fit_plain(value: Any, kind: Any) -> Any:
         value = float(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value) + 0.0 if abs(value) <= sys.float_info.max else REFUSED  # NaN is invalid; -0.0 becomes 0.0
-    if kind is str and isinstance(value, str) and not _encodes(value):
+    if kind is str and isinstance(value, str) and not is_encodable(value):
         return REFUSED
     if kind is types.NoneType:
         return value if value is None else REFUSED
@@ -228,7 +228,7 @@ def _fit_plain(value: Any, kind: Any) -> Any:
     return value if is_kind else REFUSED
 
 
-def _encodes(text: str) -> bool:
+def is_encodable(text: str) -> bool:
     """Return whether text is valid Unicode; undecodable bytes on the command line become lone surrogates."""
     try:
         text.encode()

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-LIBRARY = "vl_convert"  # contains the JavaScript of Vega and Vega-Lite
 COMMAND = re.compile(r"`([^`]+)`")
 
 

@@ -21,6 +21,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
 from tacpipe.channels.lsl import LslChannel
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.fields import is_encodable
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Chunks, Framer
 from tacpipe.sensors.sensor import Options, Samples, Sensor
@@ -183,15 +184,6 @@ def _texts(data: bytes, count: int, channels: int) -> AnyArray | None:
         return None
     if not all(isinstance(row, list) and len(row) == channels for row in rows):
         return None
-    if not all(isinstance(word, str) and _is_encodable(word) for row in rows for word in row):
+    if not all(isinstance(word, str) and is_encodable(word) for row in rows for word in row):
         return None
     return np.array(rows, dtype=object).reshape(count, channels)
-
-
-def _is_encodable(word: str) -> bool:
-    """Return whether a text can be encoded as UTF-8."""
-    try:
-        word.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

@@ -28,7 +28,6 @@ from tacpipe.sensors.sensor import Samples, Sensor
 
 COUNT = "[0-9a-fA-F]{1,4}"
 DIGITS = 4  # hexadecimal digits of a count with leading zeros
-WELCOME = b'{"message": "Welcome"}'  # shortest first message that a server sends
 MAX_TIME_S = 4e9  # maximum valid time (the year 2096)
 
 

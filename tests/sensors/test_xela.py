@@ -11,7 +11,9 @@ from tacpipe.errors import UsageError
 from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tacpipe.sensors.xela import WELCOME, Xela
+from tacpipe.sensors.xela import Xela
+
+WELCOME = b'{"message": "Welcome"}'  # shortest first message that a server sends
 
 COUNTS = [0x7F00 + number for number in range(48)]
 
