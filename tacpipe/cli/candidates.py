@@ -83,14 +83,10 @@ def candidates(
         terminal.result_json({"schema_version": 1, "candidates": rows, "units": _units(rows)})
     elif output is not None:
         terminal.result(output)
-    elif _on_terminal():
+    elif sys.stdout.isatty():
         _print_table(rows)
     else:
         terminal.result(_csv(rows).rstrip("\n"))
-
-
-def _on_terminal() -> bool:
-    return sys.stdout.isatty()
 
 
 def _cloud(path: Path, recording: str | None) -> Cloud:

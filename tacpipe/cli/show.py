@@ -115,7 +115,7 @@ def of(path: Path, *, most: int | None = None) -> Shown:
         **about,
         "recordings": _figures(opened, list(islice(opened.recordings, most)), None if most is None else READ_BYTES),
         "attributes": attributes,
-        "excluded": _exclusion_reasons(opened),
+        "excluded": {name: str(reason) for name, reason in opened.source.excluded.items()},
     }
 
 
@@ -144,10 +144,6 @@ def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
         counts = folds.setdefault(str(fold), {})
         counts[str(role)] = counts.get(str(role), 0) + 1
     return folds
-
-
-def _exclusion_reasons(opened: Dataset) -> dict[str, str]:
-    return {name: str(reason) for name, reason in opened.source.excluded.items()}
 
 
 def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:

@@ -176,7 +176,13 @@ def lines(
         *(_strokes(base, thin=thin) for thin in (True, False) if any(curve.thin is thin for curve in curves)),
     ]
     if points:
-        layers.append(_dots(base))
+        layers.append(
+            {
+                "transform": [{"filter": "datum.thin === false"}],
+                "mark": {"type": "circle", "size": 28, "clip": True},
+                "encoding": _point_channels(base),
+            }
+        )
     layers[-1]["params"] = [
         {"name": "shown", "select": {"type": "point", "fields": ["name"]}, "bind": "legend"},
         *([] if log else [zoom()]),
@@ -259,15 +265,6 @@ def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
         "transform": [{"filter": f"datum.thin === {str(thin).lower()}"}],
         "mark": {"type": "line", "clip": True, "strokeWidth": 0.7 if thin else 1.9},
         "encoding": encoding,
-    }
-
-
-def _dots(base: ChartEncoding) -> Spec:
-    """Return the layer of points that react to the pointer."""
-    return {
-        "transform": [{"filter": "datum.thin === false"}],
-        "mark": {"type": "circle", "size": 28, "clip": True},
-        "encoding": _point_channels(base),
     }
 
 

@@ -194,7 +194,16 @@ def _evaluation_result(
     }
     if predictor.quantiles is not None:
         files[COVERAGE_FILE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
-    streams[GRASPS] = _grasp_table(grasps, in_training, is_known)
+    streams[GRASPS] = pa.table(
+        {
+            "recording": pa.array(grasps.names, pa.string()),
+            "object": pa.array(grasps.objects, pa.string()),
+            "session": pa.array(grasps.sessions, pa.string()),
+            "t_ns": pa.array(grasps.t_ns, pa.int64()),
+            "seen": pa.array(in_training, pa.bool_()),
+            "known": pa.array(is_known, pa.bool_()),
+        }
+    )
     attributes = selection.combine_origins(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
@@ -288,20 +297,6 @@ def _object_csv(scores: TouchScores) -> bytes:
                 rounded = ["" if value is None else f"{value:.6g}" for value in values]
                 writer.writerow([name, predictor, target, measures["n"], *rounded])
     return text.getvalue().encode()
-
-
-def _grasp_table(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
-    """Return one row per grasp: recording, object, session, time, and whether it was in training and its object is known."""
-    return pa.table(
-        {
-            "recording": pa.array(grasps.names, pa.string()),
-            "object": pa.array(grasps.objects, pa.string()),
-            "session": pa.array(grasps.sessions, pa.string()),
-            "t_ns": pa.array(grasps.t_ns, pa.int64()),
-            "seen": pa.array(in_training, pa.bool_()),
-            "known": pa.array(is_known, pa.bool_()),
-        }
-    )
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
