@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tacpipe.arrays import AnyArray
+from tacpipe.clouds import point_files
 from tacpipe.clouds.cloud import Cloud, open3d
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
@@ -48,8 +49,6 @@ def require_metres(path: Path, cloud: Cloud) -> None:
 
 def _read_pcd(path: Path) -> Cloud:
     """Return the cloud of a PCD file; open3d reads only compressed ones. Raises `TacpipeError` as `read` does."""
-    from tacpipe.clouds import point_files
-
     content = regular.content(path)
     header = point_files.read_header(path, content)
     if header.data != "binary_compressed":
@@ -63,8 +62,6 @@ def _read_ply(path: Path) -> Cloud:
 
     open3d is not used: a crafted header makes its parser write out of bounds.
     """
-    from tacpipe.clouds import point_files
-
     xyz, colours = point_files.parse_ply(path, regular.content(path))
     _require_finite(path, xyz)
     return Cloud(xyz, colours)

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.channels import schema as channels
 from tacpipe.clouds.cloud import require_columns
 from tacpipe.errors import TacpipeError
 
@@ -90,8 +91,6 @@ class Grasp:
 
         ``wrist_x_y`` is the component along y of the wrist's first axis.
         """
-        from tacpipe.channels import schema as channels
-
         fields = [channels.float_field(name, "m", "position", name[3]) for name in POINTS]
         values = [*self.g1_m, *self.g2_m]
         if self.wrist is not None:

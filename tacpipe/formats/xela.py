@@ -13,6 +13,7 @@ import pyarrow as pa
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.csv_table import place, read_csv, read_record
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt
 
@@ -25,8 +26,6 @@ UNIT_TOLERANCE = 1e-3  # tolerance of a quaternion's norm; recordings have less 
 
 def read_uskin(path: Path) -> list[Counts]:
     """Return the 48 columns of a uSkin, each (time,), uint16 counts, ordered by taxel."""
-    from tacpipe.formats.csv_table import read_csv
-
     names = [f"txl{taxel}_{axis}" for taxel in range(1, schema.TAXELS + 1) for axis in schema.AXES]
     table = read_csv(path, names, integers=pa.uint16())
     return [table.column(name).to_numpy() for name in names]
@@ -34,8 +33,6 @@ def read_uskin(path: Path) -> list[Counts]:
 
 def read_floats(path: Path, names: Sequence[str]) -> Floats:
     """Return the columns ``names`` as an array (time, channel)."""
-    from tacpipe.formats.csv_table import read_csv
-
     table = read_csv(path, names)
     return np.column_stack([table.column(name).to_numpy() for name in names])
 
@@ -55,8 +52,6 @@ def read_marker(path: Path, name: str) -> tuple[Floats, float]:
 
 def require_unit(path: Path, quaternions: Floats, name: str) -> None:
     """Raise `TacpipeError` with file and row if a quaternion (time, 4) is not of unit length; NaN is accepted."""
-    from tacpipe.formats.csv_table import place
-
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.abs(length - 1) > UNIT_TOLERANCE
     if bad.any():
@@ -83,8 +78,6 @@ class TrialMeta:
 
     def __init__(self, path: Path) -> None:
         """Read the file. Raises `TacpipeError` unless it has one row below its header."""
-        from tacpipe.formats.csv_table import read_record
-
         self.path = path
         self.cells = read_record(path)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Indices
+from tacpipe.channels import schema as schemas
 from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
@@ -129,8 +130,6 @@ class BatchColumns:
 
 def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
     """Return the recorded schema of a stream, with a device clock if ``device``, and with the columns ``counters``."""
-    from tacpipe.channels import schema as schemas
-
     return pa.schema([schemas.time_field(), *schemas.device_fields(clock=device, counters=counters), *sensor.fields()])
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.arrays import Int64s, Times
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.io.spill import Piece, Spill
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
@@ -46,8 +47,6 @@ class Decoded:
 
     def add(self, batch: Batch) -> None:
         """Add samples. Raises Arrow's error, and adds nothing, if a value does not fit its column."""
-        from tacpipe.channels import schema
-
         if not len(batch):
             return
         device = self._device
@@ -77,8 +76,6 @@ class Decoded:
 
     def batches(self, stamping: Stamping, *, uncertain: bool) -> pa.RecordBatchReader:
         """Return the samples with UTC timestamps in batches. If ``uncertain``, a column has their possible delays."""
-        from tacpipe.channels import schema
-
         stamps = [schema.time_field()]
         if uncertain:
             stamps.append(pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"}))
@@ -275,8 +272,6 @@ def _cut_off_events(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tupl
 
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
     """Return the table of the events of all streams, sorted by time."""
-    from tacpipe.channels import schema
-
     rows = sorted((event, name) for name, stream in sealed.items() for event in stream.events)
     rows += _cut_off_events(sealed, spooled)
     rows = [

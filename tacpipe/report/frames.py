@@ -9,6 +9,9 @@ import numpy as np
 from tacpipe.comparison.runs import RecordingOutcome
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.report.blocks import Fold, ImageRow, Picture, fold, notes
+from tacpipe.video.decoding import read_frames
+from tacpipe.video.encoding import encode_images, jpeg_format
+from tacpipe.video.stream import read_format
 
 SHOWN = 4  # number of right and of wrong predictions with frames
 
@@ -53,8 +56,6 @@ def frame_folds(outcomes: Sequence[RecordingOutcome], datasets: Sequence[Dataset
 
 
 def _cameras(recording: Recording) -> list[str]:
-    from tacpipe.video.stream import read_format
-
     return [name for name in recording.streams if read_format(recording.columns(name)) is not None]
 
 
@@ -71,9 +72,6 @@ def _pictures(outcome: RecordingOutcome, recording: Recording, part: Recording |
 
     Cameras without frames, and frames that cannot be decoded, are omitted.
     """
-    from tacpipe.video.decoding import read_frames
-    from tacpipe.video.encoding import encode_images, jpeg_format
-
     pictures = []
     for stream in _cameras(recording):
         columns = recording.columns(stream)

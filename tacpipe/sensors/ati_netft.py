@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bytes, Floats
+from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
@@ -65,8 +66,6 @@ class AtiNetFT(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``status`` (uint32, 0: no error) and the load: int32 counts, or N and N m if counts per unit are set."""
-        from tacpipe.channels import schema
-
         status = pa.field("status", pa.uint32(), metadata={"unit": "1", "quantity": "status"})
         if self.counts_per_force:
             return [status, *schema.wrench_fields()]

@@ -16,6 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tacpipe.arrays import Bools, Bytes, Float32s, Floats
+from tacpipe.channels import schema
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
 from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
@@ -83,8 +84,6 @@ class Franka(Sensor):
         load. Floats are converted to float64, as for other arms. The load acts on the stiffness frame and is in the
         base frame. Each error is one bit, in the order of the interface.
         """
-        from tacpipe.channels import schema
-
         angles, speeds = schema.joint_fields(JOINTS)
         external = [
             schema.float_field(f"joint{joint}_external_torque_nm", "N m", "external_torque")

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Floats, Indices
+from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.sensors import number_texts
 from tacpipe.sensors.byte_framer import TextFramer
@@ -189,8 +190,6 @@ def _texts(root: ElementTree.Element, name: str) -> list[str]:
 
 def _fields(name: str) -> list[pa.Field]:
     """Return the fields of an output of the controller."""
-    from tacpipe.channels import schema
-
     if name == "RIst":
         return schema.pose_fields()
     if name == "RSol":

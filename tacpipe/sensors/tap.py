@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats
+from tacpipe.channels import schema
 from tacpipe.clouds.grasp import POINTS, WRIST, Grasp
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.stage import Values
@@ -61,8 +62,6 @@ class Tap(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``event`` and ``json`` (text), and the numbers (float64); or the columns of `Grasp.table` for grasps."""
-        from tacpipe.channels import schema
-
         if self.grasp:
             fields = [schema.float_field(name, "m", "position", name[3]) for name in POINTS]
             wrist = [schema.float_field(name, "1", "orientation", name[-1]) for name in WRIST]

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Bytes, Ints
+from tacpipe.channels import schema
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
@@ -94,8 +95,6 @@ def type_of(output: str) -> str | None:
 
 def fields_of(output: str) -> list[pa.Field]:
     """Return the fields of an output: the common fields of arms, or its name in lower case with a number per element."""
-    from tacpipe.channels import schema
-
     if output == POSE:
         return schema.pose_fields()
     if output == TARGET_POSE:

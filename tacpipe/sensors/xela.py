@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Counts
+from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
@@ -57,8 +58,6 @@ class Xela(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return ``taxel01_x``, … (uint16 counts), and with ``forces`` also ``taxel01_force_x_n``, … (float32, N)."""
-        from tacpipe.channels import schema
-
         counts = schema.uskin_fields(self.taxels)
         if not self.forces:
             return counts

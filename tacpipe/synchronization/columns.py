@@ -11,8 +11,20 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
+from tacpipe.io.columns import RowRanges
 from tacpipe.io.spill import MappedArrays
 from tacpipe.signals.kinematics import SignContinuation
+from tacpipe.signals.resampling import (
+    bracketing_rows,
+    in_gap,
+    is_overdue,
+    linear,
+    median_around,
+    median_before,
+    nearest_rows,
+    newest_rows,
+    slerp,
+)
 from tacpipe.synchronization import streams
 from tacpipe.synchronization.streams import TimedStream
 
@@ -55,8 +67,6 @@ class GridColumns:
         ``exact`` contains the row of each grid point, or is None if a grid point has no sample. ``storage`` may contain the
         times of stream and grid.
         """
-        from tacpipe.io.columns import RowRanges
-
         self._stream, self._grid_ns, self._exact, self._gap_ns = stream, grid_ns, exact, gap_ns
         self._storage, self._hold_values = storage, hold_values
         self._rows = RowRanges(stream.columns)
@@ -112,8 +122,6 @@ def _channels(
     ``exact`` are the rows whose times are the grid points (grid,); None if values must be interpolated. ``signs`` continues
     the signs of quaternions from the previous call. Raises `TacpipeError` if a quaternion lacks a component.
     """
-    from tacpipe.signals.resampling import bracketing_rows, nearest_rows
-
     if exact is not None:
         return [_channel_at_rows(stream, name, exact, "none") for name in stream.channels]
     groups: dict[str, list[str]] = {}
@@ -147,8 +155,6 @@ def _online_channels(stream: TimedStream, grid_ns: Times) -> list[GridColumn]:
     The value is the newest sample, with the same type; for a proximity sensor, the median of the last
     `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it.
     """
-    from tacpipe.signals.resampling import median_before, newest_rows
-
     rows = newest_rows(stream.t_ns, grid_ns)
     grid_columns = []
     for name in stream.channels:
@@ -174,8 +180,6 @@ def _interpolate_samples(
 
     ``signs`` continues the sign of a quaternion from the previous call.
     """
-    from tacpipe.signals.resampling import linear, median_around, slerp
-
     t_ns = stream.t_ns[rows]
     values = np.stack([stream.values(name)[rows] for name in names], axis=1)  # (time, channel)
     if interpolation == "slerp":
@@ -194,8 +198,6 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
 
     ``exact`` are the rows whose times are the grid points, or None.
     """
-    from tacpipe.signals.resampling import nearest_rows
-
     rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
     gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=False)
     return _masks(stream.name, stream.repeated[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
@@ -213,8 +215,6 @@ def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) ->
 
 def _online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
     """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample in ns."""
-    from tacpipe.signals.resampling import newest_rows
-
     rows = newest_rows(stream.t_ns, grid_ns)
     gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=True)
     return _masks(stream.name, stream.repeated[rows], gap, grid_ns - stream.t_ns[rows])
@@ -222,8 +222,6 @@ def _online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[Grid
 
 def _gap_mask(stream: TimedStream, grid_ns: Times, gap_ns: int, *, hold_values: bool) -> Bools:
     """Return the mask of grid points (grid,) in a gap between samples, or after a sample that is too old."""
-    from tacpipe.signals.resampling import in_gap, is_overdue, newest_rows
-
     if hold_values:
         return is_overdue(stream.t_ns[newest_rows(stream.t_ns, grid_ns)], grid_ns, gap_ns)
     return in_gap(stream.t_ns, grid_ns, gap_ns)

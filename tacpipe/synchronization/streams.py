@@ -10,13 +10,16 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe import printable
-from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times, from_arrow
+from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times, from_arrow, is_numeric, to_arrow
 from tacpipe.channels import arm
 from tacpipe.channels.streams import layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError
 from tacpipe.io.columns import Columns
 from tacpipe.io.spill import MappedArrays
 from tacpipe.plugins.stage import Attribute
+from tacpipe.signals.clocks import fit_clock, host_times
+from tacpipe.signals.repairs import HALF, RANGE, count_wraps
+from tacpipe.signals.resampling import uniform_offsets
 
 TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
@@ -97,8 +100,6 @@ class Wraps(NamedTuple):
 
     def undo(self, counts: AnyArray, first: int) -> Int32s:
         """Return ``counts`` (time,) of the rows from ``first`` as int32 without wraps."""
-        from tacpipe.signals.repairs import RANGE
-
         turns = self.turns[self.rows.searchsorted(np.arange(first, first + len(counts)), side="right")]
         return np.asarray(counts.astype(np.int32) + RANGE * turns, dtype=np.int32)
 
@@ -133,8 +134,6 @@ class TimedStream:
 
     def at(self, name: str, rows: Indices) -> AnyArray | pa.Array:
         """Return a channel of any type at ``rows``; numbers without nulls are an array of numpy."""
-        from tacpipe.arrays import is_numeric, to_arrow
-
         column = self.columns.column(name)
         return self.values(name)[rows] if is_numeric(column) else column.take(to_arrow(rows)).combine_chunks()
 
@@ -189,8 +188,6 @@ def _convert_device_times(
 
     Raises `TacpipeError` if device times are missing or no integers, or cannot be fitted.
     """
-    from tacpipe.signals.clocks import fit_clock, host_times
-
     column = columns.column(DEVICE)
     if column.null_count or not pa.types.is_integer(column.type):
         raise TacpipeError(
@@ -254,9 +251,6 @@ def unwrap_counts(stream: TimedStream) -> TimedStream:
 
 def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
     """Return the counter wraps of each channel that has any. Channels with empty rows are not checked."""
-    from tacpipe.arrays import from_arrow, is_numeric
-    from tacpipe.signals.repairs import HALF, count_wraps
-
     steps: dict[str, list[tuple[Int64s, Int32s]]] = {name: [] for name in names}
     last_counts: dict[str, int] = {}  # count in the row before a batch
     first = 0
@@ -335,8 +329,6 @@ def grid(
     online the last sample of a stream is unknown, and equal times become one point. The results are stored in ``storage``.
     Raises `TacpipeError` if there are no points.
     """
-    from tacpipe.signals.resampling import uniform_offsets
-
     first_ns = max(int(stream.t_ns[0]) for stream in streams.values())
     last_ns = (max if hold_values else min)(int(stream.t_ns[-1]) for stream in streams.values())
     origin_ns, count = int(master.t_ns[0]), len(master.t_ns)
