@@ -10,17 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Ints
-from tacpipe.report.blocks import (
-    ChartAxis,
-    ChartChannel,
-    ChartEncoding,
-    ChartLegend,
-    ChartMark,
-    ChartParam,
-    ChartScale,
-    DataRow,
-    Spec,
-)
+from tacpipe.report import blocks
 from tacpipe.report.charts.curves import (
     BETTER,
     INK,
@@ -40,7 +30,7 @@ from tacpipe.report.charts.curves import (
 
 
 def scatter(
-    rows: Iterable[DataRow],
+    rows: Iterable[blocks.DataRow],
     x: str,
     y: str,
     *,
@@ -50,7 +40,7 @@ def scatter(
     order: Sequence[str] = (),
     legend: bool = True,
     height: int = 280,
-) -> Spec:
+) -> blocks.Spec:
     """Return points of rows with ``x``, ``y``, ``name`` (which sets the colour), and optionally ``shape`` and ``tip``.
 
     With ``diagonal``, a line x = y is drawn, with ``level``, a named horizontal line. ``shapes`` are the possible
@@ -58,7 +48,7 @@ def scatter(
     """
     values = _shorten_numbers(rows)
     names = list(order) or sorted({str(row["name"]) for row in values})
-    encoding: ChartEncoding = {
+    encoding: blocks.ChartEncoding = {
         "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "padding": MARGIN}},
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": {"zero": False, "padding": MARGIN}},
         "color": {"field": "name", "type": "nominal", "legend": legend_of(len(names)) if legend else None,
@@ -71,28 +61,28 @@ def scatter(
         encoding["x"]["axis"] = axis
     if shapes:
         marks = ["circle", "triangle-up", "square", "diamond"][: len(shapes)]
-        legend_of_shapes: ChartLegend = {"title": None, "orient": "bottom", "direction": "horizontal"}
+        legend_of_shapes: blocks.ChartLegend = {"title": None, "orient": "bottom", "direction": "horizontal"}
         encoding["shape"] = {"field": "shape", "type": "nominal", "legend": legend_of_shapes,
                              "scale": {"domain": list(shapes), "range": marks}}  # fmt: skip
-    shown: ChartParam = {"name": "shown", "select": {"type": "point", "fields": ["name"]}}
+    shown: blocks.ChartParam = {"name": "shown", "select": {"type": "point", "fields": ["name"]}}
     if legend:
         shown["bind"] = "legend"
-    points: Spec = {
+    points: blocks.Spec = {
         "params": [shown, zoom()],
         "mark": {"type": "point", "filled": True, "size": 34, "clip": True},
         "encoding": encoding,
     }
-    layers: list[Spec] = []
+    layers: list[blocks.Spec] = []
     if diagonal and values:
         coordinates = [float(row[key] or 0.0) for row in values for key in ("x", "y")]
         layers.append(diagonal_of([min(coordinates), max(coordinates)]))
     if level and not math.isnan(level[1]):
-        rule: ChartMark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
+        rule: blocks.ChartMark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
         layers.append({"data": {"values": [{"y": short(level[1])}]}, "mark": rule, "encoding": {"y": y_of("y")}})
     return {"data": {"values": values}, "height": height, "layer": [*layers, points]}
 
 
-def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
+def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> blocks.Spec:
     """Return a layer of diamonds at points (name, x, y), which show their numbers under the pointer."""
     return {
         "data": {"values": [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]},
@@ -105,25 +95,25 @@ def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
     }
 
 
-def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
+def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> blocks.Spec:
     """Return a layer of lines between pairs of points (name, (x, y), (x, y)), each with its name at the first point."""
-    values: list[DataRow] = [
+    values: list[blocks.DataRow] = [
         {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
         for name, start, end in pairs
     ]
-    x: ChartChannel = {"field": "x", "type": "quantitative"}
-    rule: Spec = {
+    x: blocks.ChartChannel = {"field": "x", "type": "quantitative"}
+    rule: blocks.Spec = {
         "mark": {"type": "rule", "stroke": INK, "strokeWidth": 0.8},
         "encoding": {"x": x, "y": y_of("y"), "x2": {"field": "x2"}, "y2": {"field": "y2"}},
     }
-    text: Spec = {
+    text: blocks.Spec = {
         "mark": {"type": "text", "fontSize": 9, "fontWeight": 700, "fill": INK},
         "encoding": {"x": x, "y": y_of("y"), "text": {"field": "text"}},
     }
     return {"data": {"values": values}, "layer": [rule, text]}
 
 
-def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
+def plane(rows: Sequence[blocks.DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> blocks.Spec:
     """Return points in the plane with equal units on both axes, one panel per name, in this many columns.
 
     Rows have ``x``, ``y``, ``panel``, ``strength`` (from -1 to 1, shown by the colour) and optionally ``text``, a
@@ -138,19 +128,19 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
     }
     height_by_width = (domains["y"][1] - domains["y"][0]) / ((domains["x"][1] - domains["x"][0]) or 1.0)
     x, y = (
-        ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": domains[key], "nice": False})
+        blocks.ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": domains[key], "nice": False})
         for key in ("x", "y")
     )
     has_texts = any("text" in row for row in values)
-    opacity: ChartChannel = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
-    colour: ChartChannel = {"field": "side", "type": "nominal", "legend": None,
+    opacity: blocks.ChartChannel = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
+    colour: blocks.ChartChannel = {"field": "side", "type": "nominal", "legend": None,
               "scale": {"domain": ["a", "b", "c"], "range": [BETTER, WORSE, QUIET]}}  # fmt: skip
     tips = [tip_of(name, name) for name in dict.fromkeys(key for row in values for key in row) if name[0].isupper()]
     for row in values:
         strength = float(row.pop("strength") or 0.0)
         row["side"] = "a" if strength > 0 else "b" if strength < 0 else "c"
         row["opacity"] = short(min(1.0, 0.12 + 0.78 * abs(strength))) if strength else 0.35
-    layer: list[Spec] = [
+    layer: list[blocks.Spec] = [
         {"mark": {"type": "circle", "size": size, "stroke": QUIET if has_texts else None, "strokeWidth": 0.5},
          "encoding": {"x": x, "y": y, "color": colour, "opacity": opacity, "tooltip": tips}}
     ]  # fmt: skip
@@ -168,7 +158,7 @@ def plane(rows: Sequence[DataRow], panels: Sequence[str], *, size: int, columns:
     }  # fmt: skip
 
 
-def _shorten_numbers(rows: Iterable[DataRow]) -> list[DataRow]:
+def _shorten_numbers(rows: Iterable[blocks.DataRow]) -> list[blocks.DataRow]:
     """Return rows whose numbers have only their visible digits."""
     return [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
 
@@ -190,7 +180,7 @@ class Dot:
     panel: str = ""
 
 
-def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = None, row: int = 24) -> Spec:
+def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = None, row: int = 24) -> blocks.Spec:
     """Return a dot with its interval per predictor in the given order, one panel per question.
 
     ``level`` draws a line in the panel of each name, and ``row`` is the minimum height of a row in pixels.
@@ -201,7 +191,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
     panels = list(dict.fromkeys(estimate.panel for estimate in dots))
     lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
     row_height = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
-    values: list[DataRow] = []
+    values: list[blocks.DataRow] = []
     for index, estimate in enumerate(dots):
         is_outside = estimate.mean < low or estimate.mean > high
         values.append(
@@ -215,7 +205,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
                 "level": short((level or {}).get(estimate.panel, math.nan)),
             }
         )  # fmt: skip
-    y: ChartChannel = {
+    y: blocks.ChartChannel = {
         "field": "name",
         "type": "nominal",
         "sort": {"field": "place"},
@@ -228,16 +218,16 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
             "labelPadding": 6,
         },
     }
-    colour: ChartChannel = {
+    colour: blocks.ChartChannel = {
         "field": "kind",
         "type": "nominal",
         "legend": None,
         "scale": {"domain": list(KINDS), "range": list(KINDS.values())},
     }
-    scale: ChartScale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
-    x_channel: ChartChannel = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
+    scale: blocks.ChartScale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
+    x_channel: blocks.ChartChannel = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
     tooltip = [tip_of("name", ""), tip_of("mean", x), tip_of("interval", "95 % interval"), tip_of("kind", "kind")]
-    layer: list[Spec] = [
+    layer: list[blocks.Spec] = [
         {"mark": {"type": "rule", "stroke": QUIET, "strokeDash": [3, 3]},
          "encoding": {"x": {"field": "level", "type": "quantitative"}}},
         {"mark": {"type": "rule", "strokeWidth": 2.5, "clip": True},
@@ -285,13 +275,13 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
+def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> blocks.Spec:
     """Return a confusion matrix: a square per pair of true and predicted class that occurs, mistakes in another colour.
 
     ``counts`` are (true class, predicted class), ``down`` and ``across`` the titles of the axes.
     """
     totals = np.maximum(counts.sum(axis=1), 1)
-    values: list[DataRow] = [
+    values: list[blocks.DataRow] = [
         {
             "row": names[row], "column": names[column], "count": int(count), "right": bool(row == column),
             # the square root keeps a single mistake visible next to many correct ones
@@ -301,8 +291,8 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         for (row, column), count in np.ndenumerate(counts)
         if count
     ]  # fmt: skip
-    axis: ChartAxis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
-    position_channels: ChartEncoding = {
+    axis: blocks.ChartAxis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
+    position_channels: blocks.ChartEncoding = {
         "y": {"field": "row", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": down,
               "axis": axis},
         "x": {"field": "column", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": across,
@@ -310,13 +300,13 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
         "tooltip": [tip_of("row", down), tip_of("column", across), tip_of("count", "slides"),
                     tip_of("fraction", "fraction")],
     }  # fmt: skip
-    colour: ChartChannel = {
+    colour: blocks.ChartChannel = {
         "field": "right",
         "type": "nominal",
         "legend": None,
         "scale": {"domain": [True, False], "range": [BETTER, WORSE]},
     }
-    opacity: ChartChannel = {"field": "strength", "type": "quantitative", "scale": None, "legend": None}
+    opacity: blocks.ChartChannel = {"field": "strength", "type": "quantitative", "scale": None, "legend": None}
     return {
         "data": {"values": values},
         "height": {"step": 20},
@@ -330,20 +320,20 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
     }
 
 
-def grid(matrix: AnyFloats, title: str) -> Spec:
+def grid(matrix: AnyFloats, title: str) -> blocks.Spec:
     """Return a chart of a square matrix: a coloured square per value, blue above 0 and orange below, stronger far from 0.
 
     Squares near 0 are omitted; both axes have the same ``title``.
     """
     largest = float(np.abs(matrix).max()) or 1.0
-    values: list[DataRow] = []
+    values: list[blocks.DataRow] = []
     for (row, column), value in np.ndenumerate(matrix):
         # the square root makes small values visible next to the largest
         strength = round(math.sqrt(abs(float(value)) / largest), 2)
         if strength >= 0.01:
-            square: DataRow = {"row": row + 1, "column": column + 1, "value": short(float(value))}
+            square: blocks.DataRow = {"row": row + 1, "column": column + 1, "value": short(float(value))}
             values.append(square | {"above": bool(value > 0), "strength": strength})
-    axis: ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
+    axis: blocks.ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
     return {
         "data": {"values": values},
         "height": {"step": 13},
