@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.metrics import calibration, headline
@@ -15,9 +16,6 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Curve
 from tacpipe.tasks.material.report.methods import Method, runs_on, sensor_title, sensors_of
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 ANSWERS = "answers.csv"
 UNKNOWN = "unknown"  # answer for a slide that resembles no learned material
@@ -85,8 +83,6 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
     Columns: ``run``, ``recording``, ``known`` (whether its material was learned), ``right``, ``probability``, ``score``
     and ``refused`` (answered unknown). None if no run has a calibrated model.
     """
-    import pandas as pd
-
     parts = []
     for index, run in enumerate(runs_on(method, sensor)):
         files = run.details.dataset.files

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import pandas as pd
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import PairedRuns, observations, paired_runs
@@ -17,9 +18,6 @@ from tacpipe.report.blocks import NONE, Cell, fixed
 from tacpipe.tasks.material.report import methods
 from tacpipe.tasks.material.report.methods import ComparedRun, Method, has_usual_settings, question_on, runs_on
 from tacpipe.tasks.material.report.predictions import LEVEL, MODEL
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,6 @@ def level_skill(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL
 
 def slides_named_right(runs: Sequence[ComparedRun], sensor: str, predictor: str = MODEL) -> pd.Series:
     """Return 1 for each correctly classified slide and 0 for others, by run and recording."""
-    import pandas as pd
-
     questions = {question: None for run in runs if (question := methods.question_on(run, sensor))}
     parts = [observations(runs, question, predictor) for question in questions]
     table = pd.concat(parts) if parts else observations((), Question(), predictor)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import TaskReport
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.metrics import calibration, headline
 from tacpipe.metrics.calibration import Band
 from tacpipe.report import blocks, charts, screen
@@ -35,11 +36,6 @@ from tacpipe.tasks.touch.report.methods import (
 )
 from tacpipe.tasks.touch.report.paper import generalisation_tables, setting_tables, tables_by_object
 from tacpipe.tasks.touch.report.predictions import Score
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from tacpipe.datasets.dataset import Dataset
 
 NAMES = {MODEL: "model", CONSTANT: "constant", OBJECT_MEAN: "mean of the object"}
 EXPLAINED = (
