@@ -73,6 +73,21 @@ class FakeDataset:
     def __post_init__(self) -> None:
         self.manifest = json.loads(Manifest("evaluate", 1, {}).content) | self.manifest
 
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    def __bool__(self) -> bool:
+        return True
+
+    @property
+    def source(self) -> Manifest:
+        """The manifest with the attributes of the recordings."""
+        entries: dict[str, RecordingEntry] = {
+            name: {"attributes": dict(recording.attributes), "shards": {}}
+            for name, recording in self.recordings.items()
+        }
+        return Manifest("evaluate", 1, {}, recordings=entries)
+
 
 def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
     """Return a dataset of these recordings."""

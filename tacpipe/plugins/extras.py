@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
-import shutil
 import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import Distribution, distributions
-from importlib.util import find_spec
-from pathlib import Path
-from typing import NotRequired, TypedDict
-from urllib.parse import unquote, urlsplit
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 from tacpipe.errors import MissingModuleError
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
 
 NAME = "tacpipe"
 OWN = (NAME, "tacpipe_stages")
@@ -148,6 +145,7 @@ def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:
     path = _path(url)
     if path is None:
         return [shlex.quote(f"{NAME}[{extra}] @ {url}")]
+    from pathlib import Path
 
     is_working_folder = Path.cwd() == Path(path)
     requirement = shlex.quote(f"{'.' if is_working_folder else path}[{extra}]")
@@ -156,6 +154,9 @@ def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:
 
 def _source(distribution: Distribution) -> DirectUrl | None:
     """Return the direct URL that a distribution was installed from (PEP 610), or None if it is unknown or gone."""
+    import json
+    from pathlib import Path
+
     try:
         value: DirectUrl = json.loads(distribution.read_text("direct_url.json") or "null")
         path = _path(str(value["url"]))
@@ -170,12 +171,17 @@ def _from_index(distribution: Distribution) -> bool:
 
 def _path(url: str) -> str | None:
     """Return the path of a ``file:`` URL, or None for other URLs."""
+    from urllib.parse import unquote, urlsplit
+
     split = urlsplit(url)
     return unquote(split.path) if split.scheme == "file" else None
 
 
 def _pip() -> str:
     """Return the command for the pip of this installation: its name if the shell finds it, else its path."""
+    import shutil
+    from pathlib import Path
+
     pip = shutil.which("pip")
     ours = pip is not None and Path(pip).parent == Path(sys.executable).parent
     return "pip" if ours else f"{shlex.quote(sys.executable)} -m pip"
@@ -183,6 +189,8 @@ def _pip() -> str:
 
 def _distribution() -> Distribution | None:
     """Return the installed distribution of tacpipe, preferably one with a direct URL, or None if there is none."""
+    from importlib.metadata import distributions
+
     installed = list(distributions(name=NAME))
     return next(
         (distribution for distribution in installed if distribution.read_text("direct_url.json")),
@@ -214,6 +222,8 @@ def _normal(name: str) -> str:
 
 
 def _is_installed(module: str) -> bool:
+    from importlib.util import find_spec
+
     try:
         return module in sys.modules or find_spec(module) is not None
     except (ImportError, ValueError):

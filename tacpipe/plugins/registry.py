@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from configparser import ConfigParser
 from contextvars import ContextVar
 from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES
-from importlib.metadata import entry_points as installed_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -440,6 +439,8 @@ def package(name: str) -> str | None:
 
 def _package(target: str) -> str | None:
     """Return the name of the installed package with the entry point ``target``, if it is known."""
+    from importlib.metadata import entry_points as installed_points
+
     distributions = (point.dist for group in GROUPS for point in installed_points(group=group) if point.value == target)
     try:
         return next(
