@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 BLOCK_ROWS = 1 << 14  # rows per block
-USUAL_SPEED = 0.75  # quantile of the speed in contact, which is mostly the slide
+USUAL_SPEED = 0.75  # quantile of the speed during contact; most of the contact is the slide
 _KEPT_WHOLE = (
     "this recording has no static pressure and was kept whole, {} rows. Give --trigger load to cut out the slide where the "
     "sensor is touched and the arm moves."

@@ -214,7 +214,8 @@ def _quadric_features(name: str, points: Floats, contact_m: float) -> dict[str, 
 def _outward_normal(normal: Floats, contact_m: float) -> Floats:
     """Return the normal (xyz,) at a contact with the sign for which it points away from the object.
 
-    That is up, and to the side of the finger, which touches at ``contact_m`` on the closing axis.
+    In the grasp's axes, x points down and y is the closing axis, on which the finger touches at ``contact_m``. So an
+    outward normal has a negative x, or a y with the sign of ``contact_m``, whichever is larger.
     """
     return normal if np.sign(contact_m) * normal[1] - normal[0] > 0 else -normal
 

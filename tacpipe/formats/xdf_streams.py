@@ -336,7 +336,7 @@ def _recorder_times(stream: _StreamReading) -> _RecorderTimes | str:
     if len(measured):
         lines = clocks.fit_offsets(measured[:, 0], measured[:, 1])
         starts = [0, *(_reset_row(stream, raw_ns, measured, line.start) for line in lines[1:])]
-        t_ns = clocks.times_by_offsets(lines, starts, raw_ns)
+        t_ns = clocks.convert_by_segment(lines, starts, raw_ns)
         longest = max(lines, key=lambda line: line.stop - line.start)
         attributes = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
     else:

@@ -50,7 +50,7 @@ def to_parquet(table: pa.Table) -> bytes:
     >>> from_parquet(to_parquet(table)).equals(table)
     True
     """
-    # Arrow's stream is faster, but doubles its buffer when it grows and copies it in the end, which triples a large
+    # Arrow's stream is faster, but doubles its buffer when it grows and copies it at the end, which triples a large
     # table's memory
     sink = io.BytesIO() if table.nbytes > LARGE_BYTES else pa.BufferOutputStream()
     write(table, sink)

@@ -33,7 +33,7 @@ MAX_CELLS = 4096
 class LineColumn:
     """One column of the lines, or an array of columns."""
 
-    name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are arrays, the last braces vary fastest
+    name: str  # name of the channel; in taxel{1..4}_{x,y,z}, an array, the last braces vary fastest
     type: Type = "f32"  # u unsigned, i signed, f floating point, followed by the number of bits
     unit: str = "1"  # unit of the channel
     quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md

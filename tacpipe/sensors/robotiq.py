@@ -172,11 +172,11 @@ class Robotiq(Sensor):
 
     @functools.cached_property
     def _groups(self) -> dict[np.dtype[Any], tuple[tuple[int, int], ...]]:
-        """The keys of each block, by its type."""
+        """The keys (kind, finger) of the fields of each type, which are stored as one block."""
         groups: dict[np.dtype[Any], tuple[tuple[int, int], ...]] = {}
-        for kind in TYPES:
-            if keys := tuple(key for key in self._keys if np.dtype(KINDS[PARTS[key[0]]][1]) == kind):
-                groups[kind] = keys
+        for dtype in TYPES:
+            if keys := tuple(key for key in self._keys if np.dtype(KINDS[PARTS[key[0]]][1]) == dtype):
+                groups[dtype] = keys
         return groups
 
     def _blocks(self, frames: Bytes, columns: Columns) -> list[AnyArray]:

@@ -314,8 +314,8 @@ def find_resets(device_ns: Times, offset_ns: Int64s) -> list[int]:
     return rows
 
 
-def times_by_offsets(segments: tuple[Segment, ...], starts: list[int], device_ns: Times) -> Times:
-    """Return times of the clock (time,) on the other clock. ``starts`` are the first rows of the segments.
+def convert_by_segment(segments: tuple[Segment, ...], starts: list[int], device_ns: Times) -> Times:
+    """Convert device times (time,) to the host's clock, each row with its segment; ``starts`` are their first rows.
 
     Rows before the first segment are converted with it.
     """

@@ -12,11 +12,11 @@ from tacpipe.errors import TacpipeError
 from tacpipe.signals.clocks import (
     STEP_NS,
     clock_steps,
+    convert_by_segment,
     find_resets,
     fit_clock,
     fit_offsets,
     host_times,
-    times_by_offsets,
 )
 
 S, MS = 1_000_000_000, 1_000_000
@@ -248,7 +248,7 @@ def test_the_line_is_the_true_one_within_the_noise_of_its_measurements(drift: fl
     assert line.drift == pytest.approx(drift, abs=0.3e-6)
     at_ns = np.arange(0, 1000 * 10**9, 10**8)
     truth_ns = at_ns + 123_456_789_012 + np.rint(at_ns * drift).astype(np.int64)
-    assert np.abs(times_by_offsets(lines, [0], at_ns) - truth_ns).max() < 200_000
+    assert np.abs(convert_by_segment(lines, [0], at_ns) - truth_ns).max() < 200_000
 
 
 @pytest.mark.parametrize("set_by_s", [-3600.0, -100.0, 7.0, 86_400.0])

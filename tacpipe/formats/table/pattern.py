@@ -187,17 +187,17 @@ def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, .
     start_count = _count_common_start(kinds)
     end_count = 0
     if any(tokens != kinds[0] for tokens in kinds):
-        start_count = _count_before_slots(kinds[0], start_count)
-        end_count = _count_before_slots(
+        start_count = _count_without_open_ended(kinds[0], start_count)
+        end_count = _count_without_open_ended(
             kinds[0][::-1], _count_common_start([tokens[start_count:][::-1] for tokens in kinds])
         )
         while any(
             len(tokens) == start_count + end_count for tokens in kinds
         ):  # a placeholder has at least one character
             if start_count:
-                start_count = _count_before_slots(kinds[0], start_count - 1)
+                start_count = _count_without_open_ended(kinds[0], start_count - 1)
             else:
-                end_count = _count_before_slots(kinds[0][::-1], end_count - 1)
+                end_count = _count_without_open_ended(kinds[0][::-1], end_count - 1)
     parts = [(kinds[0][index], tuple(tokens[index][1] for tokens in names)) for index in range(start_count)]
     if any(len(tokens) > start_count + end_count for tokens in names):
         middles = tuple("".join(text for _, text in tokens[start_count : len(tokens) - end_count]) for tokens in names)
@@ -211,10 +211,10 @@ def _count_common_start(sequences: Sequence[Sequence[str]]) -> int:
     return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))
 
 
-def _count_before_slots(kinds: Sequence[str], count: int) -> int:
-    """Return how many of the first ``count`` elements remain without dates and numbers at their end.
+def _count_without_open_ended(kinds: Sequence[str], count: int) -> int:
+    """Return ``count`` less the dates and numbers at the end of the first ``count`` elements.
 
-    Next to differing text, the end of a date or number would be ambiguous.
+    If a placeholder followed one of them directly, it would be ambiguous where the date or number ends.
     """
     while count and kinds[count - 1] in ("date", "number"):
         count -= 1

@@ -242,7 +242,8 @@ class Transmission:
         elif len(self.ledger.events) < MAX_MESSAGES:
             self.ledger.add_event(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
-        if replies and self._unsent and peer is self._unsent_peer:  # after the partly sent frame
+        if replies and self._unsent and peer is self._unsent_peer:
+            # the replies follow the frame that is partly sent
             for reply in reversed(replies):
                 self._unsent.insert(1, (None, reply))
         elif replies:

@@ -201,7 +201,7 @@ class Forecaster:
         return forecaster
 
     def _check_parts(self) -> None:
-        """Predict a window of zeros. Raises `ValueError` if parts do not match."""
+        """Check that config, codec, scaling and baselines match, by predicting a window of zeros. Raises `ValueError`."""
         fits = {
             "the context": self.context == self.config["context"] > 0,
             "the horizon": self.horizon == self.config["horizon"] > 0,
@@ -210,9 +210,11 @@ class Forecaster:
             "the orientation": self.orientation.shape == (4,) and bool(self.orientation.any()),
         }
         if not all(fits.values()):
-            raise ValueError(f"{next(name for name, fine in fits.items() if not fine)} is another elsewhere")
+            raise ValueError(
+                f"{next(name for name, fine in fits.items() if not fine)} differs between the parts of the model"
+            )
         arm = np.zeros((1, self.context + self.horizon, len(self.pose.columns)))
-        arm[..., 6:] = 1
+        arm[..., 6:] = 1  # the last component of the quaternion; zeros are no rotation
         touch = np.zeros((1, self.context, len(self.codec.channels)))
         self._predict_arrays(
             *self._parts(np.concatenate([touch, arm[:, : self.context]], axis=-1), arm[:, self.context :])

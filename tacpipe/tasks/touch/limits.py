@@ -63,7 +63,7 @@ class Repeatability:
 
     pairs: int
     likeness: Estimate  # 1 - half the mean squared difference / variance within objects; 1 if equal, 0 for random pairs
-    pair_skill: Estimate  # skill over the constant of a predictor whose errors equal the differences of such pairs
+    pair_skill: Estimate  # skill, relative to a constant, of predictions as wrong as the differences within pairs
 
 
 def repeatability(

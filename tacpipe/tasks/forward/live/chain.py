@@ -127,7 +127,7 @@ class LiveChain:
         self._targets = targets
         # channels computed from frames, by stream; None if the session's first frame, to which they refer, is missing
         self._cameras = dict(cameras or {})
-        # indices of the quantiles in a band
+        # indices, among the model's quantiles, of those that are published
         self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
