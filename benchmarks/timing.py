@@ -158,8 +158,12 @@ def plugin(folder: Path, module: str, entry_points: str) -> Path:
 
 
 def environment_of(**variables: str) -> dict[str, str]:
-    """Return the environment of this process without a named store, with this Python's programs first."""
-    inherited = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
+    """Return the environment of this process with this Python's programs first, and without a named store.
+
+    Commands may write bytecode, without which each start compiles tacpipe again.
+    """
+    excluded = ("TACPIPE_STORE", "PYTHONDONTWRITEBYTECODE")
+    inherited = {name: value for name, value in os.environ.items() if name not in excluded}
     return {**inherited, "PATH": f"{BIN}{os.pathsep}{inherited.get('PATH', '')}", **variables}
 
 
