@@ -25,8 +25,6 @@ COMMANDS = (  # a small forward chain; each command names its inputs and its out
 def project(folder: Path) -> Path:
     """Return a repository in which the whole forward chain was run by DVC, on a few short recordings."""
     place = folder / "forward"
-    if place.exists():
-        return place
     place.mkdir(parents=True)
     stages: dict[str, Any] = {}
     for command in COMMANDS:

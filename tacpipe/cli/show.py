@@ -258,7 +258,7 @@ class _Labels:
     """Summary of the labels of recordings."""
 
     def __init__(self) -> None:
-        self._values: dict[str, _Values] = {}  # by label
+        self._values: dict[str, _Values] = {}  # values of all recordings, by label
 
     def counting(
         self, recordings: Iterable[tuple[str, Mapping[str, Attribute]]]

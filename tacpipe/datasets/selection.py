@@ -139,31 +139,29 @@ class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
     def __init__(self, dataset: Dataset) -> None:
         included = dataset.source.included
         is_large = isinstance(included, pages.Recordings) and len(included) == len(dataset)
-        self._entries = included if is_large else {name: included[name] for name in dataset.recordings}
+        self.entries = included if is_large else {name: included[name] for name in dataset.recordings}
 
     def __getitem__(self, name: str) -> Mapping[str, Attribute]:
-        return self._entries[name]["attributes"]
+        return self.entries[name]["attributes"]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter(self.entries)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.entries)
 
     def items(self) -> ItemsView[str, Mapping[str, Attribute]]:
         """Return names and attributes, of which each page of a manifest is loaded once."""
         return _AttributeItems(self)
 
-    def pairs(self) -> Iterator[tuple[str, Mapping[str, Attribute]]]:
-        """Yield each recording's name and attributes."""
-        return ((name, entry["attributes"]) for name, entry in self._entries.items())
-
 
 class _AttributeItems(ItemsView[str, Mapping[str, Attribute]]):
+    """Names and attributes of recordings, in the order of their entries."""
+
     _mapping: RecordingAttributes
 
     def __iter__(self) -> Iterator[tuple[str, Mapping[str, Attribute]]]:
-        return self._mapping.pairs()
+        return ((name, entry["attributes"]) for name, entry in self._mapping.entries.items())
 
 
 PUBLISHED, SIMULATED = "published", "simulated"

@@ -156,7 +156,7 @@ def _measure_duration(request: Request) -> float | None:
     """Run a training until its duration is known, and return that in seconds; None if no network is trained."""
     from tacpipe.training import following
 
-    stopwatch = _Stopwatch(following.TrainedNetwork(1))
+    stopwatch = _Stopwatch()
     try:
         with following.track_with([stopwatch]):
             pipeline.run(replace(request, executor="local", track=()))
@@ -172,16 +172,16 @@ class _TimedError(Exception):
 class _Stopwatch:
     """Times batches of the first network and then ends its training."""
 
-    def __init__(self, network: TrainedNetwork) -> None:
+    def __init__(self) -> None:
         self.all_s = 0.0  # time for reading, and for all epochs of the other networks
         self._started_s = self._begun_s = time.monotonic()
         # time, and completed fraction of the epoch, after the first batch
         self._first: tuple[float, float] | None = None
-        self._network, self._done = network, 0
+        self._remaining_epochs = 1  # of this network and of those after it
 
     def begin(self, network: TrainedNetwork, history: Sequence[Line]) -> None:
         self._begun_s = time.monotonic()
-        self._network, self._done = network, len(history)
+        self._remaining_epochs = network.epochs * (network.count - network.number + 1) - len(history)
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
         """Estimate the total duration after `TIMED_S` of batches, and raise `_TimedError`, which ends the training.
@@ -197,10 +197,7 @@ class _Stopwatch:
         if passed < 1 and now_s - since_s < TIMED_S:
             return
         epoch_s = (now_s - since_s) / (passed - before)
-        remaining_epochs = (
-            self._network.epochs - self._done + self._network.epochs * (self._network.count - self._network.number)
-        )
-        self.all_s = self._begun_s - self._started_s + epoch_s * remaining_epochs
+        self.all_s = self._begun_s - self._started_s + epoch_s * self._remaining_epochs
         raise _TimedError
 
     def line(self, line: Line, learning_rate: float) -> None:

@@ -58,7 +58,11 @@ def run(request: Request) -> Outcome:
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
     if request.track and (request.check or request.compare):
         raise UsageError("--track follows what is stored; it does not go with --check or --recompute-and-compare.")
-    trackers = _open_trackers(request.track) if request.track else {}
+    trackers: dict[str, Tracker] = {}
+    if request.track:
+        from tacpipe.trackers import tracking
+
+        trackers = tracking.open_trackers(request.track)
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
     inputs = RequestInputs(request, store)
@@ -95,12 +99,6 @@ def _conclude(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread
     outcome.rows = result.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
-
-
-def _open_trackers(texts: Sequence[str]) -> dict[str, Tracker]:
-    from tacpipe.trackers import tracking
-
-    return tracking.open_trackers(texts)
 
 
 @contextmanager

@@ -52,9 +52,8 @@ class _StreamReading:
     values: list[AnyArray] = field(default_factory=list)  # (sample, channel), samples not yet written to the spill file
     pieces: list[Piece] = field(default_factory=list)
     unspilled_rows: int = 0  # number of samples in ``values``
-    offsets: list[tuple[float, float]] = field(
-        default_factory=list
-    )  # reading of the sender's clock, offset to add, in s
+    # reading of the sender's clock, offset to add, in s
+    offsets: list[tuple[float, float]] = field(default_factory=list)
     rows_before: list[int] = field(default_factory=list)  # (offset,), number of samples before it in the file
     rows: int = 0
     missing: int = 0  # number of samples in incomplete chunks

@@ -248,9 +248,7 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
     The chart is left out for three recordings or fewer.
     """
     measure, question = comparison.measure, comparison.question
-    best = next(
-        (baseline_cell for baseline_cell in comparison.of("baseline") if baseline_cell.name == row.baseline), None
-    )
+    best = next((baseline for baseline in comparison.of("baseline") if baseline.name == row.baseline), None)
     model_sums = pairing.add_by_key((name, sums) for (_, name), sums in row.method.sums(question).items())
     sums_by_run = best.method.sums(question, best.predictor) if best else {}
     baseline_sums = pairing.add_by_key((name, sums) for (_, name), sums in sums_by_run.items())

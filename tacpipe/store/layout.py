@@ -6,6 +6,7 @@ them. Symbolic links inside a store are not followed. ``.tacpipe`` itself may be
 
 from __future__ import annotations
 
+import operator
 import os
 import re
 import stat
@@ -163,7 +164,7 @@ def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
     with readable_errors(root):
         try:
             with os.scandir(folder) as entries:
-                return sorted(entries, key=lambda entry: entry.name)
+                return sorted(entries, key=operator.attrgetter("name"))
         except (FileNotFoundError, NotADirectoryError):
             return []
 

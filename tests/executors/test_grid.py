@@ -58,7 +58,7 @@ EPOCH: Line = {"epoch": 1, "train_loss": 1.0, "val_loss": 0.5}
 def test_what_is_left_of_all_networks_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 10.0, 11.0, 13.0, 15.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    stopwatch = grid._Stopwatch(TrainedNetwork(1))
+    stopwatch = grid._Stopwatch()
     stopwatch.begin(TrainedNetwork(epochs=20, number=2, count=3), [EPOCH] * 5)
     stopwatch.batch(0.1, lambda: 0.0)  # the first one is not counted
     stopwatch.batch(0.2, lambda: 0.0)

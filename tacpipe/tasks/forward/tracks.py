@@ -87,14 +87,19 @@ def above_rest(columns: Columns, channels: Sequence[str], storage: MappedArrays)
     rest_counts = tactile.rest_counts(columns.schema, channels)
     narrow = all(_fits_float32(columns.schema.field(name).type) for name in channels)
     stored = storage.empty((columns.num_rows, len(channels)), np.float32 if narrow else np.float64)
-    first = 0
-    for batch in columns.batches(list(channels)):
-        rows = slice(first, first + batch.num_rows)
+    for rows, batch in _batches(columns, channels):
         for index, name in enumerate(channels):
             stored[rows, index] = batch.column(name).to_numpy()
         storage.read(stored[rows].nbytes)
-        first = rows.stop
     return Levels(stored, rest_counts)
+
+
+def _batches(columns: Columns, names: Sequence[str]) -> Iterator[tuple[slice, pa.Table]]:
+    """Yield the range of rows of each batch, and its table with these columns."""
+    first = 0
+    for batch in columns.batches(names):
+        yield slice(first, first + batch.num_rows), batch
+        first += batch.num_rows
 
 
 def _fits_float32(kind: pa.DataType) -> bool:
@@ -312,14 +317,11 @@ def _stored_latents(table: Columns, names: Sequence[str], finite: Bools, storage
     """
     _check_inputs(table.schema, names)
     stored = storage.empty((table.num_rows, len(names)), np.float32)
-    first = 0
-    for batch in table.batches(list(names)):
-        rows = slice(first, first + batch.num_rows)
+    for rows, batch in _batches(table, names):
         values = inputs(batch, names)
         finite[rows] &= np.isfinite(values).all(axis=1)
         stored[rows] = values
         storage.read(stored[rows].nbytes)
-        first = rows.stop
     return stored
 
 
@@ -335,9 +337,7 @@ def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloat
     signs = kinematics.SignContinuation()
     before = slice(0, 0)  # range with the row before a batch
     t_ns, placed = np.zeros(0, np.int64), np.zeros((0, POSED))
-    first = 0
-    for batch in table.batches(["t_ns", *pose.position, *pose.orientation, *angles, *speeds]):
-        rows = slice(first, first + batch.num_rows)
+    for rows, batch in _batches(table, ["t_ns", *pose.position, *pose.orientation, *angles, *speeds]):
         orientation = np.tile([0.0, 0.0, 0.0, 1.0], (batch.num_rows, 1))
         if pose.orientation:
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -358,7 +358,6 @@ def _motion(table: Columns, pose: Pose, storage: MappedArrays) -> tuple[AnyFloat
             )
         arm[rows] = np.hstack([batch_poses, velocity])
         storage.read(2 * arm[rows].nbytes)
-        first = rows.stop
     return arm, plan_velocity
 
 

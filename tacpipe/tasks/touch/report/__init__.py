@@ -114,16 +114,16 @@ def _coverage_rows(rows: pd.DataFrame, known_objects: bool) -> list[Sequence[str
     rows_shown: list[Sequence[str | Cell]] = []
     for target in (name for name in headlines.TARGETS if (name, MODEL) in bands):
         low_count, high_count = biotac_sp.RANGES[target]
-        for predictor in (item for item in NAMES if (target, item) in bands):
-            item = bands[target, predictor]
+        for predictor in (name for name in NAMES if (target, name) in bands):
+            band = bands[target, predictor]
             rows_shown.append(
                 [
                     f"{headlines.PARTS[known_objects]}, {headlines.TARGETS[target]}: {NAMES[predictor]}",
-                    f"{item.values:,}",
-                    _interval_cell(item.coverage, 2),
-                    number(100 * item.width / (high_count - low_count), 3),
-                    number(item.pinball, 3),
-                    Cell(NONE) if predictor == CONSTANT else _interval_cell([100 * part for part in item.gain], 0),
+                    f"{band.values:,}",
+                    _interval_cell(band.coverage, 2),
+                    number(100 * band.width / (high_count - low_count), 3),
+                    number(band.pinball, 3),
+                    Cell(NONE) if predictor == CONSTANT else _interval_cell([100 * part for part in band.gain], 0),
                 ]
             )
     return rows_shown
