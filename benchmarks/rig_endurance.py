@@ -1,10 +1,10 @@
 """Record an emulated rig for long, as a lab would, and hold every sample against what was sent.
 
-    python benchmarks/rig_endurance.py [--minutes 10] [--rig rigs/first-paper.toml]
+    python benchmarks/rig_endurance.py [--minutes 10] [--busy 4] [--rig rigs/first-paper.toml]
 
 The rig is emulated here; `tacpipe acquire` runs beside it as a process of its own, whose processor time and memory are
-read from the kernel. Everything that was sent between the first and the last recorded sample must be recorded, value by
-value.
+read from the kernel. With `--busy`, so many other processes use the processor all the time. Everything that was sent
+between the first and the last recorded sample must be recorded, value by value, or be reported as lost.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 import tacpipe
@@ -32,6 +34,18 @@ from tacpipe.simulation.emulation.ledger import Ledger
 BIN = Path(sys.executable).parent
 TICKS = os.sysconf("SC_CLK_TCK")
 LOOK_S = 5.0
+RIG = """
+master = "skin1"
+"""
+for name, sensor, transport, options in (
+    ("skin1", "anyskin", "serial:/dev/ttyACM0", ""),
+    ("skin2", "flexitac", "serial:/dev/ttyUSB0", ""),
+    ("force", "optoforce", "serial:/dev/ttyACM1", "axes = 3"),
+    ("wrench", "ati-netft", "udp:192.168.1.1:49152", "rate_hz = 1000"),
+    ("arm", "ur-rtde", "tcp:192.168.1.12:30004", ""),
+    ("range", "tfmini", "serial:/dev/ttyUSB1", ""),
+):
+    RIG += f'[[stream]]\nname = "{name}"\nsensor = "{sensor}"\ntransport = "{transport}"\noptions = {{ {options} }}\n'
 SETTLED_S = 15.0  # Memory should not grow after this time.
 
 
@@ -74,29 +88,42 @@ def watch_recording(command: list[str], seconds: float, store: Path) -> tuple[li
     return looks, last
 
 
-def account_stream(table: pa.Table, ledger: Ledger) -> str:
-    """Return what a recorded stream has beside what was sent; raises `AssertionError` for a sample that is wrong."""
-    counts = table.column("seq").to_numpy()
-    assert np.array_equal(np.diff(counts), np.ones(len(counts) - 1)), "the counter has gaps"
-    assert ledgers.start_of(table, ledger.samples()) is not None, "what was recorded is not what was sent"
-    return f"{len(counts):,} of {len(counts):,} sent meanwhile, all values equal"
+def account_stream(name: str, table: pa.Table, ledger: Ledger, attributes: Mapping[str, Any]) -> str:
+    """Return the numbers of a stream's sent, recorded and lost samples; raises `AssertionError` for a wrong sample."""
+    places: dict[bytes, list[int]] = {}
+    for place, key in enumerate(ledgers.keys(ledgers.sent_columns(ledger.samples()))):
+        places.setdefault(key, []).append(place)
+    last = first = -1
+    for key in ledgers.keys(ledgers.recorded_columns(table)):
+        last = next((place for place in places.get(key, []) if place > last), -2)
+        assert last >= 0, f"{name}: what was recorded is not what was sent"
+        first = last if first < 0 else first
+    lost = [attributes.get(f"{name}_lost{kind}", 0) for kind in ("", "_by_clock", "_estimated")]
+    entries = ledger.column("number")[ledger.intact_rows[[first, last]]]
+    counts = (int(entries[1] - entries[0]) + 1, last - first + 1, table.num_rows, lost[0] - lost[1], *lost[1:])
+    return f"| {name} | {' | '.join(f'{count:,}' for count in counts)} |"
 
 
 def main() -> None:
     """Record, compare, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--rig", type=Path, default=Path(__file__).parents[1] / "rigs/first-paper.toml")
+    parser.add_argument("--busy", type=int, default=0)
+    parser.add_argument("--rig", type=Path, help="by default, six devices of different kinds")
     chosen = parser.parse_args()
     sys.setswitchinterval(SWITCH_S)
     with tempfile.TemporaryDirectory(prefix="tacpipe-rig-") as name:
         folder = Path(name)
-        with Emulator(rig_of.read(chosen.rig), folder=folder / "emulated") as emulator:
+        emulated = rig_of.parse(RIG) if chosen.rig is None else rig_of.read(chosen.rig)
+        spinners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(chosen.busy)]
+        with Emulator(emulated, folder=folder / "emulated", patient=True) as emulator:
             rig = folder / "rig.toml"
             rig.write_text(rig_of.to_toml(emulator.rig))
             seconds = 60 * chosen.minutes
             words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration-s", str(seconds), "--quiet"]
             looks, sealed = watch_recording([str(BIN / "tacpipe"), *words], seconds, folder / "store")
+        for spinner in spinners:
+            spinner.kill()
         os.environ["TACPIPE_STORE"] = str(folder / "store")
         recordings = tacpipe.open(folder / "rec")
         (shard,) = recordings.recordings.values()
@@ -108,11 +135,20 @@ def main() -> None:
         print(f"resident memory: {settled[0]:.0f} MB after {SETTLED_S:g} s, {memory_figures}")
         sealing_s = sealed.at_s - first.at_s - seconds
         print(f"sealing: about {sealing_s:.0f} s more, {sealed.most_mb:.0f} MB at most, pages of the spool included")
-        for stream in shard.streams:
-            if stream == "events":
-                print(f"events: {shard.table(stream).to_pylist()}")
-                continue
-            print(f"{stream}: {account_stream(shard.table(stream), emulator.ledger[stream])}")
+        if "events" in shard.streams:
+            causes = Counter(
+                zip(*(shard.table("events").column(name).to_pylist() for name in ("stream", "cause")), strict=True)
+            )
+            print(f"events: {dict(causes)}")
+        print(
+            "| stream | measured meanwhile | sent | recorded | lost | lost by its clock | lost, about |\n"
+            "| --- | --- | --- | --- | --- | --- | --- |"
+        )
+        for stream in emulated.streams:
+            print(account_stream(stream, shard.table(stream), emulator.ledger[stream], shard.attributes))
+        subprocess.run([BIN / "tacpipe", "synchronize", folder / "rec", "-o", folder / "synchronized"], check=True)
+        (synchronized,) = tacpipe.open(folder / "synchronized").recordings.values()
+        print(f"rows after synchronize: {synchronized.table().num_rows:,}")
 
 
 if __name__ == "__main__":

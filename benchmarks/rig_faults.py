@@ -132,8 +132,8 @@ def _compare_with_sent(
             causes[event.cause] += 1
     lost = span - len(np.unique(entries[first : final + 1][delivered[first : final + 1]]))
     return Outcome(
-        name, harmed, len(sent_keys), len(delivered_keys), wrong - unwanted, unwanted, lost, reading.lost,
-        _longest(ledger, entries[delivered]), dict(causes),
+        name, harmed, len(sent_keys), len(delivered_keys), wrong - unwanted, unwanted, lost,
+        reading.losses.certain + reading.losses.estimated, _longest(ledger, entries[delivered]), dict(causes),
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ Example: tacpipe extract markers data/recordings -o data/markers
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import file_digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
+from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.plugins.stage import Fitted, RecordingOutput, Result, Workspace, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
@@ -227,21 +229,39 @@ def _replace_frames(
     from tacpipe.video.stream import read_format
 
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
+    rows: dict[str, RowCounts] = {}
     has_frames = False
     for name in recording.streams:
         columns = recording.columns(name)
         video_format = read_format(columns)
         if video_format is None:
-            streams[name] = _copy_stream(columns)
+            streams[name], rows[name] = _copy_stream(columns), RowCounts.all_used(columns.num_rows)
         else:
             has_frames = True
-            streams[name] = compute(f"Recording {recording.name}, stream {name}", columns, video_format)
+            values = compute(f"Recording {recording.name}, stream {name}", columns, video_format)
+            streams[name] = _count_frames(values, columns, functools.partial(rows.__setitem__, name))
     if not has_frames:
         raise TacpipeError(
             f"Recording {recording.name} has no stream of frames; its streams are {', '.join(recording.streams)}. Give the "
             f"recording of a camera, as `tacpipe ingest` or `tacpipe acquire` wrote it."
         )
-    return RecordingOutput(streams)
+    return RecordingOutput(streams, rows=rows)
+
+
+def _count_frames(
+    values: pa.RecordBatchReader, columns: Columns, state: Callable[[RowCounts], None]
+) -> pa.RecordBatchReader:
+    """Return the values computed from frames; when they are read, ``state`` gets the counts of the frames' rows."""
+    import pyarrow as pa
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        used = 0
+        for batch in values:
+            used += batch.num_rows
+            yield batch
+        state(RowCounts.some_used(columns.num_rows, used, "without an image"))
+
+    return pa.RecordBatchReader.from_batches(values.schema, batches())
 
 
 def _copy_stream(columns: Columns) -> pa.RecordBatchReader:
@@ -301,21 +321,25 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import read_format
 
-    streams: list[list[tuple[Columns, VideoFormat]]] = []  # by recording
+    streams: list[list[tuple[str, Columns, VideoFormat]]] = []  # by recording
     for recording in recordings:
-        formats = [(columns, read_format(columns)) for columns in map(recording.columns, recording.streams)]
-        streams.append([(columns, video_format) for columns, video_format in formats if video_format])
-    total = sum(columns.num_rows for frame_streams in streams for columns, _ in frame_streams)
+        columns_by_stream = {stream: recording.columns(stream) for stream in recording.streams}
+        formats = [(stream, columns, read_format(columns)) for stream, columns in columns_by_stream.items()]
+        streams.append([(stream, columns, video_format) for stream, columns, video_format in formats if video_format])
+    total = sum(columns.num_rows for frame_streams in streams for _, columns, _ in frame_streams)
     if not total:
         raise TacpipeError("The training recordings have no frames. Give the recordings of a camera.")
     step = max(1, total // count)
     images = []
-    for frame_streams in filter(None, streams):
-        reduced = []
-        for columns, video_format in frame_streams:
-            frames = decode_frames(video_format, read_batches(columns))
+    for recording, frame_streams in zip(recordings, streams, strict=True):
+        reduced: list[Bytes] = []
+        for stream, columns, video_format in frame_streams:
+            frames, before = decode_frames(video_format, read_batches(columns)), len(reduced)
             reduced += [reduce_image(image) for row, image in frames if row % step == 0]
-        images.append(np.array(reduced, np.uint8))
+            counts = RowCounts.some_used(columns.num_rows, len(reduced) - before, "not sampled")
+            count_rows(recording.name, stream, counts)
+        if frame_streams:
+            images.append(np.array(reduced, np.uint8))
     return images
 
 

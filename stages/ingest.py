@@ -28,7 +28,7 @@ ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), Conta
 XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
 
 
-@ROSBAG.stage(version=3)
+@ROSBAG.stage(version=4)
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
@@ -40,7 +40,7 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     return ROSBAG.read(params, files, values)
 
 
-@MCAP.stage(version=3)
+@MCAP.stage(version=4)
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read MCAP files (ROS, JSON or protobuf messages).
 
@@ -52,7 +52,7 @@ def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     return MCAP.read(params, files, values)
 
 
-@HDF5.stage(version=3)
+@HDF5.stage(version=4)
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
@@ -65,7 +65,7 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     return HDF5.read(params, files, values)
 
 
-@XDF.stage(version=1)
+@XDF.stage(version=2)
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 
@@ -104,7 +104,7 @@ def preview_zarr(params: ZarrParams, source: Path) -> str:
         return ZARR.preview(params, source)
 
 
-@ZARR.stage(version=3, preview=preview_zarr)
+@ZARR.stage(version=4, preview=preview_zarr)
 def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
     """Read Zarr stores, such as replay buffers of UMI.
 
@@ -165,7 +165,7 @@ def why_unread_table(params: TableParams, source: Path) -> Callable[[str], str]:
     return contained.why_unread(params.parsed(), source)
 
 
-@stage(version=1, discover=discover_table, preview=preview_table, guess=guess_table, why_unread=why_unread_table)
+@stage(version=2, discover=discover_table, preview=preview_table, guess=guess_table, why_unread=why_unread_table)
 def table(params: TableParams, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
     """Read a lab's own tables (CSV, Excel, Parquet, NumPy).
 

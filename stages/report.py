@@ -9,6 +9,7 @@ Example: tacpipe report results/forward -o report.html
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,8 +18,10 @@ from tacpipe.plugins.stage import Result, stage
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.datasets.lineage import CountedRows
 
     Datasets = tuple[Dataset, ...]
+    Rows = Sequence[Sequence[CountedRows]]
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,11 @@ class Params:
     traces: NonNegativeInt = 2  # number of recordings whose predictions are drawn, for each forecast shown in full
 
 
-@stage(version=12)
-def report(params: Params, results: Datasets) -> Result:
+@stage(version=13)
+def report(params: Params, results: Datasets, rows: Rows) -> Result:
     """Return a page with the answer, charts, tables, and the source of every number."""
     from tacpipe.report import page
 
+    for result, chain_rows in zip(results, rows, strict=True):
+        result.chain_rows = chain_rows
     return Result(files={"report.html": page.render(results, title=params.title, traces=params.traces)})

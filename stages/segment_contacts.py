@@ -13,12 +13,12 @@ Example: tacpipe segment contacts data/synced -o data/segments
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tacpipe.channels.streams import COUNT, common_unit, count_axes, missing_channel_error
-from tacpipe.errors import UsageError
+from tacpipe.channels.streams import AT_ARRIVAL, COUNT, common_unit, count_axes, missing_channel_error
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
@@ -27,8 +27,9 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import AnyArray, Floats
+    from tacpipe.arrays import AnyArray, Bools, Floats
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
     from tacpipe.signals.contact import Thresholds
 
 
@@ -98,6 +99,7 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
 
     columns = recording.columns()
     t_ns = from_arrow(columns.column("t_ns"))  # (time,)
+    is_timed = _timed_rows(recording.name, columns)
     columns.forget()
     loads: list[Floats] = []
     thresholds: list[Thresholds] = []
@@ -113,15 +115,25 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
             for table in columns.batches(names):
                 yield np.column_stack([from_arrow(table.column(name)) for name in names])  # (time, channel)
 
+        def timed_blocks(blocks: Callable[[], Iterator[AnyArray]] = blocks) -> Iterator[AnyArray]:
+            first = 0
+            for values in blocks():
+                rows = is_timed[first : first + len(values)]
+                first += len(values)
+                if rows.any():
+                    yield values if rows.all() else values[rows]
+
         axes = count_axes(schema, names)
-        level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
+        level, at_rest = measure_rest(params.rest, timed_blocks, t_ns[is_timed], params.rest_s)
+        rest_rows = np.zeros(len(t_ns), bool)
+        rest_rows[is_timed] = at_rest
         load, repeated = load_in_blocks(blocks, level, axes)
         loads.append(load)
         if stream in fixed_streams:
             thresholds.append(Thresholds(params.on_count, params.off_count))
         else:
-            thresholds.append(_fixed_thresholds(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
-        tare_values = tare_level(params.tare, next(blocks()), level, axes)
+            thresholds.append(_fixed_thresholds(params, noise_thresholds(repeated, load, rest_rows)))
+        tare_values = tare_level(params.tare, next(timed_blocks()), level, axes)
         rest_metadata |= {name: {"rest": repr(float(value))} for name, value in zip(names, tare_values, strict=True)}
     all_loads = np.array(loads)  # (sensor, time)
     loads.clear()
@@ -142,6 +154,26 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
         return with_metadata(table.append_column(field, contact), rest_metadata)
 
     return RecordingOutput(change(columns, add_contact), _threshold_attributes(units, thresholds, fixed_streams), notes)
+
+
+def _timed_rows(name: str, columns: Columns) -> Bools:
+    """Return a mask of the rows (time,) whose sampling time is known; others do not determine the level at rest.
+
+    Raises `TacpipeError` without such rows.
+    """
+    import numpy as np
+
+    from tacpipe.arrays import from_arrow
+
+    if AT_ARRIVAL not in columns.column_names:
+        return np.ones(columns.num_rows, bool)
+    is_timed: Bools = ~from_arrow(columns.column(AT_ARRIVAL))
+    if not is_timed.any():
+        raise TacpipeError(
+            f"Recording {name} has no row whose sampling time is known, because its master does not measure at a constant "
+            "rate. Synchronize it with --rate-hz."
+        )
+    return is_timed
 
 
 def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:

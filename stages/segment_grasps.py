@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed, StoredAs, Unit
+from tacpipe.plugins.rows import UNNEEDED, RowCounts
 from tacpipe.plugins.stage import RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
@@ -67,6 +68,7 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.clouds.segmentation import SegmentationLimits, object_rows
 
     streams = {name: recording.table(name) for name in recording.streams}
+    rows_by_stream = {name: RowCounts.all_used(table.num_rows) for name, table in streams.items()}
     if set(FINISHED) <= set(streams) and "biotac_sp" not in streams:
         return RecordingOutput(streams)
     missing = [
@@ -96,16 +98,21 @@ def grasps(params: Params, recording: Recording) -> RecordingOutput:
             rows = object_rows(scene, Grasp.from_table(streams["grasp"]), limits, params.seed)
             colours = None if scene.colours is None else scene.colours[rows]
             streams["cloud"] = Cloud(scene.points_m[rows], colours).table()
+            rows_by_stream["scene"] = RowCounts.some_used(len(scene), len(streams["cloud"]), "not of the object")
         if "biotac_sp" in streams:
-            reading["reading"], attributes["contact_ns"] = _reading_at_touch(params, streams.pop("biotac_sp"))
+            samples = streams.pop("biotac_sp")
+            reading["reading"], attributes["contact_ns"], used = _reading_at_touch(params, samples)
+            rows_by_stream["biotac_sp"] = RowCounts.some_used(samples.num_rows, used, "outside the reading")
     except TacpipeError as error:
         raise TacpipeError(f"Recording {recording.name}: {error}") from error
     output_streams = {name: table for name, table in streams.items() if table.num_rows == 1 or name == "cloud"}
-    return RecordingOutput({**output_streams, **reading}, attributes)
+    for name in streams.keys() - output_streams.keys():
+        rows_by_stream[name] = RowCounts.some_used(streams[name].num_rows, 0, UNNEEDED)
+    return RecordingOutput({**output_streams, **reading}, attributes, rows=rows_by_stream)
 
 
-def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
-    """Return the settled reading of both fingers, as one row, and the time in ns at which both first touched.
+def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int, int]:
+    """Return the settled reading of both fingers as one row, the time in ns of the first touch, and the rows of the reading.
 
     Raises `TacpipeError` if columns or values are missing, or the fingers never press or settle.
     """
@@ -136,4 +143,4 @@ def _reading_at_touch(params: Params, stream: pa.Table) -> tuple[pa.Table, int]:
                 f"the grasp out."
             )
         medians.append(np.rint(np.nanmedian(values, keepdims=True)))
-    return schema.stream(t_ns[rows.start : rows.start + 1], medians, fields), int(t_ns[contact])
+    return schema.stream(t_ns[rows.start : rows.start + 1], medians, fields), int(t_ns[contact]), rows.stop - rows.start

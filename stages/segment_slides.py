@@ -30,6 +30,7 @@ from tacpipe.plugins.constraints import (
     Unit,
 )
 from tacpipe.plugins.params import added
+from tacpipe.plugins.rows import OUTSIDE, UNNEEDED, RowCounts
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
+# quantities of the streams that the speed and force of an arm are computed from
+ARM_QUANTITIES = ("joint_position", "joint_velocity", "position", "velocity", "force")
 BLOCK_ROWS = 1 << 14  # rows per block
 USUAL_SPEED = 0.75  # quantile of the speed during contact; most of the contact is the slide
 _KEPT_WHOLE = (
@@ -116,7 +119,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.signals import slides as slide_signals
 
     if params.trigger == "load":
-        return _slide_by_load(params, recording.name, columns_of(recording))
+        return _slide_by_load(params, recording, columns_of(recording))
     streams = streams_of(recording)
     table = finger_stream(recording.name, streams)
     t_ns = table.column("t_ns").to_numpy()  # (time,)
@@ -126,7 +129,7 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     if not pressures:
         notes = [_KEPT_WHOLE.format(len(t_ns))] if len(t_ns) > params.frames else []
         attributes = {"slide_frames": len(t_ns), "spikes": int(spikes.sum()), "outside_protocol": False}
-        return RecordingOutput({"slide": table}, attributes, notes)
+        return RecordingOutput({"slide": table}, attributes, notes, _count_rows(recording, streams, len(t_ns)))
     pressure = table.column(pressures[0]).to_numpy()
     profile = arm.profile(streams, t_ns)
     try:
@@ -153,10 +156,30 @@ def slides(params: Params, recording: Recording) -> RecordingOutput:
     tables = {"slide": table.slice(first, stop - first).combine_chunks()}
     if profile:
         tables["profile"] = arm.profile_table(t_ns, pressure, profile, slide_signals.phases(len(t_ns), slide))
-    return RecordingOutput(tables, attributes)
+    used = len(t_ns) if profile else stop - first  # the profile has the pressure of every row
+    return RecordingOutput(tables, attributes, rows=_count_rows(recording, streams, used, has_arm=bool(profile)))
 
 
-def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | Columns]) -> RecordingOutput:
+def _count_rows(
+    recording: Recording, streams: Mapping[str, pa.Table | Columns], used: int, *, has_arm: bool = False
+) -> dict[str, RowCounts]:
+    """Return the rows of each stream, of which ``used`` ones of the finger; those of an arm within the finger's time."""
+    finger = finger_stream(recording.name, streams)
+    counts_of_finger = RowCounts.some_used(finger.num_rows, used, "outside the slide")
+    if recording.streams == ("",):
+        return {"": counts_of_finger}
+    begin_ns, end_ns = finger.column("t_ns").to_numpy()[[0, -1]]
+    rows: dict[str, RowCounts] = {}
+    for name, table in streams.items():
+        t_ns = table.column("t_ns").to_numpy()
+        is_arm = has_arm and any(columns_with_quantity(table, quantity) for quantity in ARM_QUANTITIES)
+        inside = int(((t_ns >= begin_ns) & (t_ns <= end_ns)).sum()) if is_arm else 0
+        arm_counts = RowCounts.some_used(len(t_ns), inside, OUTSIDE if is_arm else UNNEEDED)
+        rows[name] = counts_of_finger if table is finger else arm_counts
+    return rows
+
+
+def _slide_by_load(params: Params, recording: Recording, streams: Mapping[str, pa.Table | Columns]) -> RecordingOutput:
     """Return the slide of a sensor with any unit: the rows in contact in which the arm moves, if it was recorded.
 
     Raises `TacpipeError` if there is no tactile stream or no slide.
@@ -169,7 +192,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     from tacpipe.signals import slides as slide_signals
     from tacpipe.signals.contact import OFF_FRACTION, Thresholds, load_in_blocks, measure_rest, noise_thresholds
 
-    stream = finger_stream(name, streams)
+    name, stream = recording.name, finger_stream(recording.name, streams)
     t_ns, names = stream.column("t_ns").to_numpy(), columns_with_quantity(stream, "tactile")
     measured = np.ones(len(names), bool)  # (channel,), whether a channel has a value in each row
 
@@ -183,7 +206,7 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     level, rows = measure_rest(params.rest, blocks, t_ns, params.rest_s)
     loads, repeated = load_in_blocks(blocks, level, count_axes(stream.schema, names))
     if params.load_trigger is None:
-        limits = noise_thresholds(repeated, loads, t_ns, params.rest_s, rows)
+        limits = noise_thresholds(repeated, loads, rows)
     else:
         limits = Thresholds(params.load_trigger, OFF_FRACTION * params.load_trigger)
     unit = common_unit(stream.schema, names)
@@ -223,7 +246,9 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table | C
     }
     if profile and np.isfinite(profile["speed_m_s"][kept_rows]).all():
         attributes["speed_m_s"] = round(float(np.median(profile["speed_m_s"][kept_rows])), 5)
-    return RecordingOutput({"slide": table.slice(first - begin, stop - first).combine_chunks()}, attributes)
+    rows_by_stream = _count_rows(recording, streams, stop - first, has_arm=bool(profile))
+    slide_table = table.slice(first - begin, stop - first).combine_chunks()
+    return RecordingOutput({"slide": slide_table}, attributes, rows=rows_by_stream)
 
 
 def _batches(stream: pa.Table | Columns, names: Sequence[str]) -> Iterator[pa.Table]:

@@ -5,17 +5,19 @@ Example: tacpipe split data/segments -o data/split --calibration 0.15
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import RecordingOutput, Result, Roles, stage
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Result, Roles, stage
+from tacpipe.printable import listed
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.datasets.splits import Scheme
 
 SHOWN = 5  # maximum number of folds listed in a note; further ones are counted
 
@@ -45,6 +47,22 @@ class Split:
         if self.few_of and not all(self.few_of.partition("=")):
             raise UsageError(f"few_of is {self.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
 
+    @property
+    def assigned(self) -> Scheme:
+        """The scheme that assigns roles."""
+        from tacpipe.datasets.splits import Scheme
+
+        values = asdict(self)
+        return Scheme(name=values.pop("scheme"), **values)
+
+    def separated(
+        self, attributes: Mapping[str, Mapping[str, Attribute]], extend: Roles, equal: Sequence[Sequence[str]]
+    ) -> list[Sequence[str]]:
+        """Return the groups of ``equal`` recordings that the scheme would give different roles; they enter the key."""
+        from tacpipe.datasets import splits
+
+        return splits.separated(splits.assign(attributes, self.assigned, extend), equal)
+
 
 @dataclass(frozen=True)
 class Tested(Split):
@@ -69,6 +87,7 @@ class Random(Tested):
     # random: roles drawn at random
     scheme: Literal["random"] = "random"
     repeats: PositiveInt = 1  # number of folds, each drawn separately
+    group: Names = added("")  # attributes whose values stay whole, such as object,session; empty: none
 
 
 @dataclass(frozen=True)
@@ -79,6 +98,16 @@ class Kfold(Split):
     scheme: Literal["kfold"] = "kfold"
     folds: Annotated[int, Range(2)] = 5  # number of parts
     apart: str = ""  # attribute whose values are also distributed, each absent from training in one fold; empty: none
+    group: Names = added("")  # attributes whose values stay whole, such as object,session; empty: none
+
+    def check(self) -> None:
+        """Raise `UsageError` for group with apart, which tests some recordings of a group and trains on others."""
+        super().check()
+        if self.group and self.apart:
+            raise UsageError(
+                f"group is {self.group} and apart is {self.apart}; apart divides groups. Give one of them, or the scheme "
+                f"leave-one-out by {self.apart}."
+            )
 
 
 @dataclass(frozen=True)
@@ -115,19 +144,20 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
     """Assign each recording a role: train, val, calibration or test.
 
     Returns one table, ``split``, with one row per recording and fold: recording, fold, role. Recordings with a role in
-    the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.
+    the older split ``extend`` keep it. Recordings with equal content have the same role. Notes name these, and folds
+    without validation recordings, unless ``val`` is 0.
     """
     import pyarrow as pa
 
-    from tacpipe.datasets.selection import RecordingAttributes
-    from tacpipe.datasets.splits import Scheme, assign, sufficient_val, without_val
+    from tacpipe.datasets.selection import RecordingAttributes, equal_recordings
+    from tacpipe.datasets.splits import assign, separated, sufficient_val, without_val
 
-    values = asdict(params)
-    scheme = Scheme(name=values.pop("scheme"), **values)
     attributes = RecordingAttributes(recordings)
-    roles = assign(attributes, scheme, extend or {})
+    equal = equal_recordings(attributes.entries)
+    joined = equal if params.separated(attributes, extend or {}, equal) else []
+    roles = assign(attributes, params.assigned, extend or {}, joined)
     bare = without_val(roles) if params.val else []
-    enough = sufficient_val(attributes, scheme, extend or {}) if bare else None
+    enough = sufficient_val(attributes, params.assigned, extend or {}, joined) if bare else None
     table = pa.table(
         {
             "recording": pa.array([name for name, _ in roles], pa.string()),
@@ -136,7 +166,17 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
         }
     )
     notes = [_note_on_val(bare, len({fold for _, fold in roles}), len(attributes), params.val, enough)] if bare else []
+    notes += [_note_on_equal(equal, separated(roles, equal))] if equal else []
     return Result(recordings={"split": RecordingOutput(table)}, notes=notes)
+
+
+def _note_on_equal(groups: Sequence[Sequence[str]], separate: Sequence[Sequence[str]]) -> str:
+    """Return a note on groups of recordings with equal content, some of which an older split keeps ``separate``."""
+    copies = sum(map(len, groups)) - len(groups)
+    examples = listed([" = ".join(group) for group in separate or groups], SHOWN)
+    roles = f"keep different roles of the split to extend: {examples}" if separate else f"have its role: {examples}"
+    subject = "1 recording has" if copies == 1 else f"{copies} recordings have"
+    return f"{subject} the content of another one, and {roles}. `tacpipe label --exclude` removes copies."
 
 
 def _note_on_val(

@@ -1,16 +1,17 @@
 """Bring all streams of a recording onto one clock.
 
-The output has one table for each recording, over the time that all streams cover, with masks of repeated samples and of
-gaps. Rows are at the stamps of one stream, the master, and contain the newest sample of every other stream that had
-arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows are at a constant rate. --values
-interpolate is for offline analysis: its rows look ahead, and live sessions refuse a model that was trained on them.
+The output has one table for each recording, with masks of repeated samples and of gaps. It has one row for each sample of
+one stream, the master, at the time when it was measured, from when all streams have started. A row contains the newest
+sample of every other stream that had arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows
+are at a constant rate. --values interpolate is for offline analysis: its rows look ahead, and live sessions refuse a
+model that was trained on them.
 
 Example: tacpipe synchronize data/recordings -o data/synced
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -19,13 +20,16 @@ from tacpipe.channels import streams as masks
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
+from tacpipe.plugins.rows import LATE, OUTSIDE, UNNEEDED, RowCounts
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Values, stage
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.arrays import Bools
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.synchronization.streams import TimedStream
 
 
 IN_MEMORY = 1 << 25  # maximum bytes of times in memory; further times are stored in a temporary file
@@ -45,7 +49,7 @@ class Params(StreamSelection):
     master: str = ""  # stream whose first sample starts the grid; empty: that of the rig file, or the first tactile one
     # maximum time between samples without a gap, marked in a mask; without it 50, below 20 Hz 2.5 periods of the stream
     gap_ms: Annotated[PositiveFloat, Unit("ms")] | None = None
-    # time of a sample: arrival; device: its own stamp; auto: arrival for hold, else device if there is one
+    # time of a sample with --values interpolate: arrival; device: its own stamp; auto: device if there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of 16-bit tactile counts; other channels do not change
 
@@ -81,7 +85,7 @@ class Params(StreamSelection):
         }
 
 
-@stage(version=3, reads=("master",))
+@stage(version=4, reads=("master", "ended"))
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """Resample the streams of each recording to one clock.
 
@@ -105,16 +109,16 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     hold_values = params.values == "hold"
     clock = "arrival" if hold_values else params.clock
     storage = MappedArrays(IN_MEMORY)
-    timed_streams = {
-        name: streams.to_host_clock(recording.name, name, columns, clock, storage)
-        for name, columns in signal_streams.items()
+    placed_streams = {
+        name: streams.place_stream(recording, name, columns, clock, storage) for name, columns in signal_streams.items()
     }
     master_name = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in signal_streams.items()}
-    master = timed_streams[streams.master(recording.name, master_name, schemas)]
-    grid_ns, rows = streams.grid(
-        recording.name, params.timeline, params.rate_hz, timed_streams, master, storage, hold_values=hold_values
+    master = placed_streams[streams.master(recording.name, master_name, schemas)]
+    grid = streams.find_rows(
+        recording.name, params.timeline, params.rate_hz, placed_streams, master, storage, hold_values=hold_values
     )
+    grid_ns = grid.t_ns
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if omitted := [name for name in recorded_streams if name not in signal_streams]:
         attributes["not_synchronized"] = streams.join_names(omitted)
@@ -125,13 +129,13 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     ahead_ns[:] = 0
     gaps: dict[str, pa.Array] = {}  # masks (grid,) by name
     readers: list[GridColumns] = []
-    for name, stream in timed_streams.items():
-        exact = None if hold_values else streams.rows_at(stream.t_ns, grid_ns, rows, storage)
+    for name, stream in placed_streams.items():
+        exact = None if hold_values else streams.rows_at(stream.t_ns, grid_ns, storage)
         if params.unwrap:
             stream = streams.unwrap_counts(stream)
             attributes |= {f"{name}_wrapped_channels": len(stream.wraps)} if stream.wraps else {}
         gap_ns = default_gap_ns(stream.t_ns, storage.release) if params.gap_ms is None else round(params.gap_ms * 1e6)
-        readers.append(GridColumns(stream, grid_ns, exact, gap_ns, storage, hold_values=hold_values))
+        readers.append(GridColumns(stream, grid, exact, gap_ns, storage, hold_values=hold_values))
         if not stream.truth:
             gaps[name + masks.GAP] = to_arrow(readers[-1].gaps())
             if not hold_values:
@@ -141,13 +145,18 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
             attributes[f"{name}_fresh_hz"] = round(new_frame_rate_hz(stream.t_ns, stream.repeated), 3)
             attributes |= stream.attributes
         storage.release()
+    at_arrival = storage.empty((len(grid_ns),), bool)
+    at_arrival[:] = master.at_arrival[grid.numbers] if params.rate_hz is None else False
     attributes[masks.LOOK_AHEAD_MEAN] = round(float(ahead_ns.mean()) / 1e6, 3) if len(ahead_ns) else 0.0
     attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max(initial=0)) / 1e6, 3)
-    times = master.columns.schema.field("t_ns")
+    notes = [*masks.describe_gaps(pa.Table.from_pydict(gaps)), *_time_notes(master, at_arrival, placed_streams)]
+    fields = masks.row_fields(master.columns.schema.field("t_ns"), held=hold_values)
 
     def batches() -> Iterator[pa.RecordBatch]:
-        for points in grid_ranges(grid_ns, list(timed_streams.values()), BLOCK_BYTES):
-            columns = [(times, grid_ns[points]), *(column for reader in readers for column in reader.read(points))]
+        for points in grid_ranges(grid_ns, list(placed_streams.values()), BLOCK_BYTES):
+            arrivals = [grid.arrival_ns[points], at_arrival[points]] if hold_values else []
+            columns = list(zip(fields, [grid_ns[points], *arrivals], strict=True))
+            columns += [column for reader in readers for column in reader.read(points)]
             arrays = [to_arrow(values, kind.type) if hasattr(values, "dtype") else values for kind, values in columns]
             yield pa.RecordBatch.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
             storage.release()
@@ -157,4 +166,27 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     result = pa.Table.from_batches([first])
     if second is not None:
         result = pa.RecordBatchReader.from_batches(first.schema, chain([first, second], remaining))
-    return RecordingOutput(result, attributes, masks.describe_gaps(pa.Table.from_pydict(gaps)))
+    rows_by_stream = {
+        name: RowCounts.some_used(columns.num_rows, 0, UNNEEDED) for name, columns in recorded_streams.items()
+    }
+    for (name, stream), reader in zip(placed_streams.items(), readers, strict=True):
+        used = reader.used_samples()
+        unused = {OUTSIDE: len(stream.t_ns) - used, LATE: stream.late}
+        rows_by_stream[name] = RowCounts(len(stream.t_ns) + stream.late, used, unused)
+    return RecordingOutput(result, attributes, notes, rows_by_stream)
+
+
+def _time_notes(master: TimedStream, at_arrival: Bools, streams: Mapping[str, TimedStream]) -> list[str]:
+    """Return notes on rows without a known sampling time, ``at_arrival`` (row,), and on estimated losses of ``streams``."""
+    notes = []
+    if at_arrival.mean() > masks.WARNING_SHARE:
+        notes.append(
+            f"{at_arrival.mean():.1%} of the rows are at the arrival of their sample, because the rate of {master.name} is "
+            "not known there or not constant. No model is trained or scored on them. Give --rate-hz for rows at a constant "
+            "rate."
+        )
+    return notes + [
+        f"About {stream.estimated_lost:,} samples of {name} were lost: later ones arrived as if so many were missing."
+        for name, stream in streams.items()
+        if stream.estimated_lost > 0
+    ]

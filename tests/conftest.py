@@ -83,16 +83,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--every", default="1/1", help="K/N: of all chosen tests, run each Nth from the Kth; N: from the first."
     )
-    parser.addoption("--slow", default="1/1", help="K/N: of those marked long or rig, run each Nth from the Kth.")
     parser.addoption("--faults", default="1/1", help="K/N: of those marked faults, run each Nth from the Kth.")
 
 
 @pytest.hookimpl(trylast=True)  # The markers choose what runs first.
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    faults = {id(item) for item in items if item.get_closest_marker("faults")}
-    slow = {id(item) for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")} - faults
-    deselected = left_out([id(item) for item in items if id(item) in slow], config.getoption("--slow"))
-    deselected |= left_out([id(item) for item in items if id(item) in faults], config.getoption("--faults"))
+    faults = [id(item) for item in items if item.get_closest_marker("faults")]
+    deselected = left_out(faults, config.getoption("--faults"))
     deselected |= left_out([id(item) for item in items], config.getoption("--every"))
     config.hook.pytest_deselected(items=[item for item in items if id(item) in deselected])
     items[:] = [item for item in items if id(item) not in deselected]

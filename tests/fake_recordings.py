@@ -69,6 +69,7 @@ class FakeDataset:
     recordings: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     manifest: dict[str, Any] = field(default_factory=dict)
+    chain_rows: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
         self.manifest = json.loads(Manifest("evaluate", 1, {}).content) | self.manifest

@@ -40,6 +40,7 @@ FREE = {  # params that are any text, and why
     "split.few_by": "an attribute of recordings",
     "split.few_of": "an attribute and its value; `check` looks at the form",
     "split.apart": "an attribute of recordings",
+    "split.group": "attributes of recordings, which are the lab's own",
     "split.by": "an attribute of recordings",
     "train.forward.arm": "a stream of recordings",
     "train.material.label": "a label of recordings, which are the lab's own",

@@ -144,3 +144,14 @@ def test_the_limit_of_a_control_group_above_counts_in_both_versions(
     monkeypatch.setattr(memory, "GROUPS", tmp_path)
     monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
     assert memory.available() == 5000 - 3000 + 500
+
+
+def test_blocks_of_bounded_memory_that_overlap_leave_no_limit_behind() -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    first, second = memory.bounded(1 << 30, "a"), memory.bounded(1 << 29, "b")
+    first.__enter__()
+    second.__enter__()
+    assert resource.getrlimit(resource.RLIMIT_DATA)[0] != before[0]
+    first.__exit__(None, None, None)
+    second.__exit__(None, None, None)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before

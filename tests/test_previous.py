@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 
-from tacpipe.datasets import manifest, pages
+from tacpipe.datasets import directory, lineage, manifest, pages
 from tacpipe.engine.previous import Previous, Reusable
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
 from tacpipe.store import presence, records
+from tacpipe.store.location import locate
 from tacpipe.store.records import Summary
 from tests.conftest import FileCalls, Lab
 from tests.test_presence import DAY_NS, FAULTS
@@ -50,7 +51,13 @@ def clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): file_digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+    """Return the digests of the files of a dataset by path, and the rows that were read for it."""
+    paths = {str(path.relative_to(folder)): file_digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+    if not (folder / manifest.NAME).exists():
+        return paths
+    store = locate(folder)
+    counted = lineage.counted_rows(store, manifest.find(folder).manifest, directory.stored_key(store, folder))
+    return {**paths, "rows": json.dumps(counted, sort_keys=True)}
 
 
 def first_run(lab: Lab, place: Path, command: str) -> dict[str, str]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.datasets.splits import Roles, Scheme, assign
+from tacpipe.datasets.splits import Roles, Scheme, assign, separated
 from tacpipe.errors import TacpipeError
 
 OBJECTS = ("4", "10", "bottle")
@@ -367,3 +367,48 @@ def test_few_counts_those_that_an_older_split_trains_on() -> None:
 def test_options_that_cannot_be_say_why(scheme: Scheme, message: str) -> None:
     with pytest.raises(TacpipeError, match=message):
         assign(recordings(6), scheme)
+
+
+@given(st.sampled_from(["random", "kfold"]), st.integers(0, 99), st.integers(1, 4))
+def test_values_of_the_group_stay_whole_in_every_fold(name: str, seed: int, trials: int) -> None:
+    labelled = {
+        f"o{i}-{trial}": {"object": f"o{i}", "session": f"s{i // 2}"} for i in range(16) for trial in range(trials)
+    }
+    roles = assign(labelled, Scheme(name, folds=4, seed=seed, val=0.2, test=0.25, group="object, session"))
+    sessions = [[name for name, labels in labelled.items() if labels["session"] == f"s{i}"] for i in range(8)]
+    assert len(roles) == len(labelled) * (4 if name == "kfold" else 1)
+    assert not separated(roles, sessions)
+    tests = Counter(recording for (recording, _), role in roles.items() if role == "test")
+    assert sum(tests.values()) == len(labelled) * (1 if name == "kfold" else 0.25)
+    assert set(tests.values()) == {1}
+
+
+def test_groups_that_share_recordings_are_one_group() -> None:
+    labelled = {f"t{i}": {"object": f"o{i % 6}", "session": f"s{i // 4}"} for i in range(24)}
+    with pytest.raises(TacpipeError, match="2 folds cannot be made of 1 groups by object,session"):
+        assign(labelled, Scheme("kfold", folds=2, group="object,session"))
+    roles = assign(labelled, Scheme("kfold", folds=2, group="session", val=0.4))
+    assert {role for (_, fold), role in roles.items() if fold == 0} == {"train", "val", "test"}
+
+
+@given(st.sampled_from(["random", "kfold", "blocked", "leave-one-out", "authors"]), st.integers(0, 99))
+def test_equal_recordings_have_one_role_in_every_scheme(name: str, seed: int) -> None:
+    labelled = {f"t{i:02d}": {"object": f"o{i % 4}", "authors_role": ("train", "test")[i % 3 == 0]} for i in range(24)}
+    equal = [["t00", "t01", "t13"], ["t02", "t23"]]
+    roles = assign(labelled, Scheme(name, seed=seed), {}, equal)
+    assert not separated(roles, equal)
+    if name in ("leave-one-out", "authors"):  # the scheme selects what is tested: recordings are only added to that
+        plain = assign(labelled, Scheme(name, seed=seed))
+        assert {key for key, role in plain.items() if role == "test"} <= {
+            key for key, role in roles.items() if role == "test"
+        }
+
+
+def test_a_copy_takes_the_role_of_the_recording_in_the_older_split() -> None:
+    labelled = recordings(12)
+    older = assign(labelled, Scheme(test=0.3))
+    copies = {f"copy-{name}": labels for name, labels in labelled.items()}
+    equal = [[f"copy-{name}", name] for name in labelled]
+    roles = assign({**labelled, **copies}, Scheme(test=0.3), older, equal)
+    assert {(name, fold): role for (name, fold), role in roles.items() if name in labelled} == older
+    assert all(roles[f"copy-{name}", 0] == role for (name, _), role in older.items())

@@ -25,14 +25,35 @@ VIBRATIONS = 22  # readings of dynamic pressure per frame: 2200 Hz at 100 frames
 TRIANGLES, TRIANGLE_TAXELS = 6, 10  # triangular modules of a RoboSkin patch, and their taxels
 AXES = ("x", "y", "z")
 COMPONENTS = ("x", "y", "z", "w")
+# metadata of ``t_ns``: whether times are arrivals or sampling times, and the declared period in ns
+STAMPS, ARRIVAL, PERIOD = "stamps", "arrival", "period_ns"
 
 
-def time_field(origin: str | None = None) -> pa.Field:
-    """Return the field ``t_ns``, int64 nanoseconds. ``origin`` describes how times without a clock were computed."""
+def time_field(origin: str | None = None, *, arrivals: bool = False, period_ns: int | None = None) -> pa.Field:
+    """Return the field ``t_ns``, int64 nanoseconds.
+
+    ``origin`` describes how times without a clock were computed. With ``arrivals``, times are arrivals on the host, from
+    which `synchronize` estimates when samples were measured; otherwise they are sampling times. ``period_ns`` is the
+    declared period of the samples.
+    """
     import pyarrow as pa
 
-    metadata = {"unit": "ns", "quantity": "time", **({"made": origin} if origin else {})}
+    metadata = {"unit": "ns", "quantity": "time"}
+    metadata |= {"made": origin} if origin else {}
+    metadata |= {STAMPS: ARRIVAL} if arrivals else {}
+    metadata |= {PERIOD: str(period_ns)} if period_ns is not None else {}
     return pa.field("t_ns", pa.int64(), metadata=metadata)
+
+
+def has_arrivals(field: pa.Field) -> bool:
+    """Return whether the field ``t_ns`` states that its times are arrivals."""
+    return (field.metadata or {}).get(STAMPS.encode()) == ARRIVAL.encode()
+
+
+def declared_period_ns(field: pa.Field) -> int | None:
+    """Return the declared period of the samples in the metadata of ``t_ns``, or None."""
+    period = (field.metadata or {}).get(PERIOD.encode())
+    return None if period is None else int(period)
 
 
 def device_fields(*, clock: bool, counters: Iterable[str]) -> list[pa.Field]:

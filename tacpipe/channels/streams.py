@@ -222,6 +222,7 @@ def remove_spikes(
 
 
 GRID = "grid"  # attribute of synchronized recordings: uniform, logged or fresh
+ARRIVAL, AT_ARRIVAL = "t_arrival_ns", "at_arrival"  # columns of synchronized recordings, beside t_ns
 GAP = "_gap"  # suffix of gap masks
 GAP_MS = "_gap_ms"  # suffix of attributes of synchronized recordings: longest time without a gap
 LOOK_AHEAD_MEAN, LOOK_AHEAD_MAX = "look_ahead_mean_ms", "look_ahead_max_ms"  # attributes of a synchronized recording
@@ -230,15 +231,33 @@ _MAX_STEP = {"logged": 3.0, "fresh": 3.0}  # longest step without missing rows a
 _UNIFORM = 1.5
 
 
-def gap_mask(table: pa.Table) -> Bools:
-    """Return a mask of rows (time,) in a gap of any stream, from the columns that end in ``_gap``."""
+def row_fields(master: pa.Field, *, held: bool) -> list[pa.Field]:
+    """Return the fields of the times of synchronized rows: ``t_ns`` and, with ``held`` values, of two further columns.
+
+    ``master`` is the field ``t_ns`` of the master, which may state how times without a clock were computed.
+    `ARRIVAL` is when the row's samples had arrived. `AT_ARRIVAL` is True where the sampling time of the master's sample is
+    unknown, so that ``t_ns`` is its arrival.
+    """
+    import pyarrow as pa
+
+    time = {"unit": "ns", "quantity": "time"}
+    origin = {key: value for key, value in (master.metadata or {}).items() if key == b"made"}
+    fields = [pa.field("t_ns", pa.int64(), metadata={**time, **origin})]
+    if held:
+        fields.append(pa.field(ARRIVAL, pa.int64(), metadata=time))
+        fields.append(pa.field(AT_ARRIVAL, pa.bool_(), metadata={"unit": "1", "quantity": "mask"}))
+    return fields
+
+
+def unusable_rows(table: pa.Table) -> Bools:
+    """Return a mask of rows (time,) in a gap of any stream (columns that end in ``_gap``), or without a known time."""
     import numpy as np
 
-    gap = np.zeros(table.num_rows, dtype=bool)
+    unusable = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
-        if name.endswith(GAP):
-            gap |= table.column(name).to_numpy().astype(bool)
-    return gap
+        if name.endswith(GAP) or name == AT_ARRIVAL:
+            unusable |= table.column(name).to_numpy().astype(bool)
+    return unusable
 
 
 def gap_shares(table: pa.Table | Columns) -> dict[str, float]:

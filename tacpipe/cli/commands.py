@@ -24,6 +24,7 @@ SUMMARIES = {
     "live": "Predict while a rig is recorded.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show the content of a dataset, split, model or result.",
+    "check": "Find faults in recordings: time, channels, labels, copies.",
     "compare": "Compare results: the best first, columns for what differs.",
     "track": "Send models and results to trackers of experiments.",
     "view": "Show recordings on one time axis, in Rerun's viewer.",
@@ -99,6 +100,7 @@ def _add_label(program: typer.Typer) -> None:
             "recordings": changed.recordings,
             "labels": parsed_labels,
         }
+        note_labels(changed.directory)
         terminal.result_json(value) if as_json else terminal.result(changed.directory)
 
 
@@ -257,6 +259,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "live": _from_module("live"),
     "label": _add_label,
     "show": _add_show,
+    "check": _from_module("check"),
     "compare": _add_compare,
     "track": _add_track,
     "view": _from_module("view"),
@@ -285,6 +288,14 @@ def refuse_others(*others: object, option: str = "--from") -> None:
         raise UsageError(
             f"{option} names recordings and labels itself. Leave out names, --label, --interval, --exclude and --include."
         )
+
+
+def note_labels(dataset: Path) -> None:
+    """Print a note for labels of a dataset that are written in several ways."""
+    from tacpipe.datasets import consistency, labels, manifest
+
+    for sentence in consistency.label_notes(labels.attributes(manifest.find(dataset).manifest)):
+        terminal.note(f"tacpipe: {sentence}")
 
 
 def label_intervals(dataset: Path, path: Path, *, as_json: bool) -> None:
@@ -338,6 +349,7 @@ def label_from_table(dataset: Path, path: Path, key: str, *, dry_run: bool, as_j
             terminal.result(_describe_changes(current, changes, len(current), unmatched))
         return
     changed = labels.change_each(dataset, labels_for) if changes else None
+    note_labels(dataset)
     if unmatched:
         terminal.note(f"tacpipe: {path} has no row for {len(unmatched)} recordings: {listed(unmatched)}.")
     if as_json:

@@ -15,15 +15,21 @@ from tacpipe import printable
 from tacpipe.channels import streams
 from tacpipe.cli import model_overview
 from tacpipe.cli.show_recording import RATES, StreamFigures, gaps_text, stream_figures
+from tacpipe.datasets import directory as directory_of
+from tacpipe.datasets import lineage
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.dataset import Dataset
+from tacpipe.datasets.lineage import CountedRows
 from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
+from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.rows import TABLE_HEADS, table_of_rows
 from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
 from tacpipe.store.location import locate
+from tacpipe.store.store import Store
 
 SHOWN = 20  # maximum number of recordings that are listed; further ones are counted
 # maximum number of stored bytes to read; further streams are listed with only their number of rows
@@ -41,6 +47,7 @@ class DatasetOverview(TypedDict):
     files: dict[str, int]  # sizes in bytes
     bytes: int
     rows: int
+    counted: CountedRows  # rows that were read to produce the dataset
 
 
 class ShownModel(DatasetOverview, model_overview.ModelOverview):
@@ -92,7 +99,7 @@ def of(path: Path, *, most: int | None = None) -> Shown:
     stored = manifest_of.find(path)
     store = locate(stored.directory)
     opened = Dataset(stored.manifest, execution.reader(store, (str(stored.directory.absolute()),), stored.manifest))
-    about = _common_overview(opened)
+    about = _common_overview(opened, directory_of.stored_key(store, stored.directory.absolute()), store)
     if model_overview.is_result(opened):
         return {"kind": "result", **about, **model_overview.of_result(opened, stored, store)}
     if model_overview.is_model(opened):
@@ -119,8 +126,8 @@ def of(path: Path, *, most: int | None = None) -> Shown:
     }
 
 
-def _common_overview(opened: Dataset) -> DatasetOverview:
-    """Return the entries of an overview that every kind of dataset has."""
+def _common_overview(opened: Dataset, key: str, store: Store) -> DatasetOverview:
+    """Return the entries of an overview that every kind of dataset has; ``key`` names its run in ``store``."""
     manifest = opened.source
     return {
         "stage": manifest.stage,
@@ -129,6 +136,7 @@ def _common_overview(opened: Dataset) -> DatasetOverview:
         "files": {name: file["bytes"] for name, file in manifest.files.items()},
         "bytes": manifest.shard_bytes,
         "rows": manifest.rows,
+        "counted": lineage.counted_rows(store, manifest, key),
     }
 
 
@@ -176,7 +184,17 @@ def to_text(value: Shown, *, full: bool = False) -> str:
     elif value["kind"] == "split":
         lines = _split_text(value)
     origin = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-    return printable.lines([*lines, *model_overview.files_text(value["files"], full=full), origin])
+    lines += [*_rows_lines(value["counted"]), *model_overview.files_text(value["files"], full=full), origin]
+    return printable.lines(lines)
+
+
+def _rows_lines(counted: CountedRows) -> list[str]:
+    """Return the table of the rows that were read, by stage and stream, and the number of results without counts."""
+    lines: list[str] = []
+    if rows := [TerminalRow(row) for row in table_of_rows(counted["stages"])]:
+        lines = ["", *TerminalTable(TABLE_HEADS, [RowGroup("", rows)], left=(0, 1, 4)).text().splitlines(), ""]
+    uncounted = counted["uncounted"]
+    return [*lines, *([f"rows read: not counted for {format_count(uncounted, 'results')}"] if uncounted else [])]
 
 
 def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
@@ -206,7 +224,7 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
         )
     labels = _Labels()
     incomplete = spool_folders.describe_incomplete(labels.counting(value["attributes"].items()), value["recordings"])
-    lines += ["", *labels.lines(full)]
+    lines += [*_rows_lines(value["counted"]), "", *labels.lines(full)]
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
     lines += incomplete
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
@@ -230,28 +248,32 @@ def _split_text(value: ShownSplit) -> list[str]:
 
 
 class _Values:
-    """Summary of a label's values: the count of each value, or the range of fractional numbers."""
+    """Summary of a label's values: the count of each value, or the range if all are numbers with fractions."""
 
     def __init__(self) -> None:
-        self._counts: Counter[str] | None = Counter()  # None after a float was added
+        self._counts: Counter[str] = Counter()  # values without a fraction
+        self._floats: Counter[str] = Counter()  # fractional numbers, the first few
+        self._is_numeric = True
         self._least, self._most = float("inf"), float("-inf")
 
     def add(self, value: Any) -> None:
         """Add the label's value in another recording."""
         if isinstance(value, int | float):
             self._least, self._most = min(self._least, value), max(self._most, value)
-        if isinstance(value, float):
-            self._counts = None
-        elif self._counts is not None:
+        if not isinstance(value, float):
             self._counts[str(value)] += 1
+            self._is_numeric &= isinstance(value, int) and not isinstance(value, bool)
+        elif len(self._floats) <= SHOWN:
+            self._floats[str(value)] += 1
 
     def __str__(self) -> str:
         """Return the range, or each value with its count, or the number of values if there are many."""
-        if self._counts is None:
+        if self._floats and self._is_numeric:
             return f"{self._least:g} to {self._most:g}"
-        if len(self._counts) > SHOWN:
-            return f"{len(self._counts)} values"
-        return ", ".join(f"{value} ({count})" for value, count in sorted(self._counts.items()))
+        counts = self._counts + self._floats
+        if len(counts) > SHOWN:
+            return f"{'over ' if len(self._floats) > SHOWN else ''}{len(counts)} values"
+        return ", ".join(f"{value} ({count})" for value, count in sorted(counts.items()))
 
 
 class _Labels:

@@ -13,7 +13,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
 from tacpipe.plugins import registry
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals.runs import run_starts as run_starts
 
 LEVELS, INCREMENTS = "levels", "increments"
@@ -145,7 +145,7 @@ class Raw:
 
     def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
         """Return ``values`` as float32, shape (time, channel)."""
-        check_channels(self.channels, channels)
+        check_channels(self.channels, channels, is_fitted=False)
         return values.astype(np.float32)
 
     def decode(self, latents: AnyFloats) -> AnyFloats:
@@ -171,10 +171,23 @@ def encode_finite(project: Callable[[AnyFloats], AnyFloats], inputs: AnyFloats, 
     return latents
 
 
-def check_channels(expected: Sequence[str], channels: Sequence[str]) -> None:
-    """Raise `TacpipeError` unless ``channels`` are those that the codec was fitted on, in the same order."""
+def check_channels(expected: Sequence[str], channels: Sequence[str], *, is_fitted: bool = True) -> None:
+    """Raise `TacpipeError` unless ``channels`` are the ``expected`` ones in the same order.
+
+    Those are the channels that the codec was fitted on, or, if not ``is_fitted``, those of the first recording.
+    """
     if tuple(expected) == tuple(channels):
         return
+    if not is_fitted:
+        missing = [name for name in expected if name not in channels]
+        more = [name for name in channels if name not in expected]
+        lacks = [f"it lacks {listed(missing, 4)}"] if missing else []
+        has = [f"it also has {listed(more, 4)}"] if more else []
+        raise TacpipeError(
+            f"The tactile columns differ from those of the first training recording: "
+            f"{' and '.join(lacks + has) or 'they come in another order'}. Exclude the "
+            f"recording with `tacpipe label`, or leave the column out of all recordings."
+        )
     position = next((i for i, pair in enumerate(zip(expected, channels, strict=False)) if pair[0] != pair[1]), None)
     if position is None:
         difference = f"it was fitted on {len(expected)} channels and is given {len(channels)}"

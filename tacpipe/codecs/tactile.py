@@ -11,7 +11,6 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.channels.schema import field_metadata
-from tacpipe.channels.streams import gap_mask as gap_mask
 from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
 from tacpipe.datasets.dataset import Recording

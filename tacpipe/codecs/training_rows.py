@@ -10,12 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.channels import streams
 from tacpipe.codecs import codec, measures, tactile
 from tacpipe.codecs.codec import check_channels
 from tacpipe.datasets import splits
 from tacpipe.datasets.dataset import Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.io.columns import Columns
+from tacpipe.plugins.rows import IN_GAP, NO_CONTACT, RowCounts, count_rows
 
 HELD_OUT = 0.15  # fraction of the training recordings that measure a codec
 log = logging.getLogger(__name__)
@@ -95,7 +97,7 @@ class StoredRows:
         """
         for name in sorted(names):
             try:
-                yield from self._pieces(self.recordings[name].columns())
+                yield from self._pieces(name, self.recordings[name].columns())
             except TacpipeError as error:
                 raise TacpipeError(f"{name}: {error}") from error
 
@@ -115,25 +117,27 @@ class StoredRows:
     def _empty(self) -> AnyFloats:
         return np.zeros((0, self.frames * len(self.channels)))
 
-    def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
+    def _pieces(self, name: str, stored: Columns) -> Iterator[AnyFloats]:
         """Yield chunks of the rows (row, frames * channel) of a recording that are suitable for fitting a codec.
 
         Raises `TacpipeError` if its channels differ.
         """
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
-        begins, gaps = codec.run_starts(tactile.times(stored)), tactile.gap_mask(stored)
+        begins, gaps = codec.run_starts(tactile.times(stored)), streams.unusable_rows(stored)
         in_contact = np.ones(len(begins), dtype=bool)
         if "contact" in stored.column_names:
             in_contact = stored.column("contact").to_numpy() >= 0
         stored.forget()
-        stacking, row = codec.Stacking(self.representation, self.frames), 0
+        stacking, row, used = codec.Stacking(self.representation, self.frames), 0, np.zeros(len(begins), dtype=bool)
         for table in stored.batches(self.channels):
             chunk = slice(row, row + table.num_rows)
             counts = tactile.above_rest(table, self.channels)
             counts[gaps[chunk]] = np.nan  # makes all results of such a row NaN
             stacked = stacking.next(counts, begins[chunk])
-            yield stacked[np.isfinite(stacked).all(axis=1) & in_contact[chunk]]
+            used[chunk] = np.isfinite(stacked).all(axis=1) & in_contact[chunk]
+            yield stacked[used[chunk]]
             row += table.num_rows
+        count_rows(name, "", RowCounts.from_masks(used, [(NO_CONTACT, ~in_contact)], IN_GAP))
 
 
 def held_out(names: Collection[str]) -> frozenset[str]:

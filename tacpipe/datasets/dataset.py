@@ -17,6 +17,7 @@ from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
+from tacpipe.plugins.rows import note_opened
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, suggestion
 from tacpipe.store.records import Content, RecordingEntry
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.arrays import Arrays, Tensors
+    from tacpipe.datasets.lineage import CountedRows
     from tacpipe.datasets.windows import Windows
     from tacpipe.io.columns import Columns
 
@@ -116,7 +118,9 @@ class Recording:
         from tacpipe.io.parquet import from_parquet
 
         if stream in self._shards:
-            return from_parquet(self._content(stream), columns)
+            table = from_parquet(self._content(stream), columns)
+            note_opened(self.name, stream, table.num_rows)
+            return table
         from tacpipe.datasets.overview import stored_columns
 
         stored = self.columns() if self.streams == ("",) else None
@@ -139,6 +143,7 @@ class Recording:
         columns = self._opened.get(stream)
         if columns is None:
             columns = self._opened[stream] = Columns(self._content(stream))
+            note_opened(self.name, stream, columns.num_rows)
         return columns
 
     def _content(self, stream: str) -> bytes | Path:
@@ -209,6 +214,7 @@ class Dataset:
         self.recordings: Mapping[str, Recording] = _Recordings(self, manifest.included, read, names)
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
         self._read, self._opener = read, opener
+        self.chain_rows: Sequence[CountedRows] = ()  # rows that were read for it, set by a stage that shows them
 
     def __len__(self) -> int:
         return len(self.recordings)

@@ -138,7 +138,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
         if before is not None and lasting:
             _adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        key = _stored_key(store, directory) if relabelled else planned.key
+        key = stored_key(store, directory) if relabelled else planned.key
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
         sweep(directory, shards=any("/" in path for path in stale), deep=manifest.exported)
@@ -152,7 +152,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
             _settle(store, directory, stale)
 
 
-def _stored_key(store: Store, directory: Path) -> str:
+def stored_key(store: Store, directory: Path) -> str:
     """Return the key in the root of a directory, empty without one."""
     root = store.roots.get(directory)
     return "" if root is None else root.get("key", "")

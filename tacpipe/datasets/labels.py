@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from math import isfinite
 from pathlib import Path
 
 from tacpipe.datasets import directory as directory_of
@@ -21,7 +20,7 @@ _NAMED = 5  # number of recordings named in an error
 
 
 def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[str, Attribute]:
-    """Return the labels in ``name=value`` texts; numbers and true, false, null are parsed as in YAML.
+    """Return the labels in ``name=value`` texts; numbers and true, false, null are parsed.
 
     Raises `UsageError` if a text is not a label, or there is nothing to change.
     """
@@ -46,13 +45,7 @@ def of_text(text: str) -> Attribute:
     """Return the value of a text that is a number, true, false or null, or else the text."""
     from tacpipe.io import config_text
 
-    try:
-        value = config_text.load_yaml(text)
-    except ValueError:
-        return text
-    if isinstance(value, float) and not isfinite(value):
-        return text
-    return value if isinstance(value, str | int | float | None) else text
+    return None if text == "null" else config_text.plain_value(text)
 
 
 @dataclass(frozen=True)

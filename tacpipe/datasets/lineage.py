@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict, TypeVar, final
 
@@ -12,9 +12,11 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import InputDataset, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
+from tacpipe.io import Json
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
 from tacpipe.printable import listed
 from tacpipe.store import records
@@ -126,6 +128,45 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Proven
         if file is not None and file["digest"] == manifest:
             return record["provenance"]
     return None
+
+
+class CountedRows(TypedDict):
+    """The rows that were read to produce a dataset."""
+
+    stages: dict[str, Json]  # rows by stage; some runs include those of preceding stages
+    uncounted: int  # number of results of older versions, whose rows were not counted
+
+
+def counted_rows(store: Store, manifest: Manifest, key: str) -> CountedRows:
+    """Return the rows that the run ``key``, which produced a dataset, read; "" if the run is unknown."""
+    record = store.record(key) if key else None
+    stages = dict(records.summary(record).get("stage_rows") or {}) if record is not None else {}
+    try:
+        mapped = manifest.stage == manifest_of.ACQUIRE or registry.load(manifest.stage).mapped
+    except TacpipeError:  # the plug-in was removed
+        mapped = True
+    results = stages[manifest.stage]["results"] if manifest.stage in stages else 0
+    return {"stages": stages, "uncounted": max(0, (len(manifest.recordings) if mapped else 1) - results)}
+
+
+def chain_rows(store: Store, manifest: Manifest, name: str) -> list[CountedRows]:
+    """Return the rows that were read for a dataset and for the datasets that it comes from, the oldest first.
+
+    ``name`` is the digest of the manifest. Datasets whose manifest is lost are left out.
+    """
+    key_by_manifest = {root["manifest"]: root.get("key", "") for root in store.roots.all()}
+
+    visited: set[str] = set()
+
+    def collect(node: Manifest, name: str) -> Iterator[CountedRows]:
+        visited.add(name)
+        for dataset in node.inputs.get("datasets", ()):
+            source = manifest_of.stored_or_none(store, dataset["manifest"])
+            if source is not None and dataset["manifest"] not in visited:
+                yield from collect(source, dataset["manifest"])
+        yield counted_rows(store, node, key_by_manifest.get(name, ""))
+
+    return list(collect(manifest, name))
 
 
 def _describe_changes(store: Store, root: Root | None, now: Manifest) -> list[str] | None:

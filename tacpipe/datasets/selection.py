@@ -164,6 +164,21 @@ class _AttributeItems(ItemsView[str, Mapping[str, Attribute]]):
         return ((name, entry["attributes"]) for name, entry in self._mapping.entries.items())
 
 
+def equal_recordings(entries: Mapping[str, RecordingEntry]) -> list[list[str]]:
+    """Return the groups of recordings whose streams have equal names and digests, each sorted by name.
+
+    >>> shard = {"digest": "1f", "bytes": 4, "rows": 1}
+    >>> equal_recordings({name: {"attributes": {}, "shards": {"": shard}} for name in "ba"})
+    [['a', 'b']]
+    """
+    names_by_content: dict[object, list[str]] = {}
+    for part in pages.parts(entries):
+        for name, entry in sorted(part.items()):
+            content = frozenset((stream, shard["digest"]) for stream, shard in entry["shards"].items())
+            names_by_content.setdefault(content or name, []).append(name)
+    return [sorted(names) for names in names_by_content.values() if len(names) > 1]
+
+
 PUBLISHED, SIMULATED = "published", "simulated"
 
 

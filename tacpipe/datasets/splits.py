@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
 SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # fractions of validation recordings that errors suggest
 _NAMED = 12  # number of attributes named in an error
 UNUSED = "unused"  # role of recordings that a few-shot split removes from training
+_PRECEDENCE = ("test", "val", "calibration", "train", UNUSED)  # the first role of equal recordings becomes that of all
 Attributes = Mapping[str, Attribute]
 Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
 
@@ -40,6 +41,8 @@ class Scheme:
     by: str = "object"  # leave-one-out: attribute whose values are tested one by one
     stratify: str = ""  # comma-separated attributes whose values are spread evenly over the roles; empty for none
     apart: str = ""  # kfold: attribute whose values are divided among the folds, each unknown in one; empty for none
+    # random, kfold: comma-separated attributes, recordings with equal values stay together; empty: none
+    group: str = ""
     repeats: int = 1  # random: number of folds, each drawn independently
     reverse: bool = False  # blocked: test the first recordings and train on the last
     few: int = 0  # number of training recordings; others are unused; 0 for all
@@ -48,7 +51,12 @@ class Scheme:
     few_of: str = ""
 
 
-def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
+def assign(
+    attributes: Mapping[str, Attributes],
+    scheme: Scheme,
+    keep: Mapping[tuple[str, int], str] = {},
+    equal: Sequence[Sequence[str]] = (),
+) -> Roles:
     """Return the role of each recording in each fold. ``attributes`` contains the attributes of each recording by name.
 
     ============== =====================================================================================
@@ -74,26 +82,46 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     With ``few``, only this number of the training recordings is used, spread evenly over the values of ``stratify``;
     the others have the role ``unused``. The recordings of a smaller ``few`` are a subset of those of a larger one.
 
+    With ``group``, recordings that share the value of one of its attributes have the same role. Groups are drawn like
+    recordings, so fractions are those of groups.
+
     ``keep`` contains the roles of an older split, which are not changed; only recordings without a role are assigned.
+    ``equal`` are groups of recordings with equal content, which get the same role: they are drawn as one recording, or
+    if the scheme selects the test recordings, all have the role of the first in the order test, val, calibration, train.
     Raises `TacpipeError` for an invalid scheme, fraction or attribute, and if no recording is left for training.
     """
-    _check(attributes, scheme)
-    fresh = sorted(set(attributes).difference(name for name, _ in keep))
+    older_names = {name for name, _ in keep}
+    is_drawn = scheme.name in ("random", "blocked") or (scheme.name == "kfold" and not scheme.apart)
+    leaders = _leaders(attributes, scheme, older_names, equal if is_drawn else ())
+    drawn = (
+        {name: labels for name, labels in attributes.items() if leaders.get(name, name) == name}
+        if leaders
+        else attributes
+    )
+    _check(drawn, scheme)
+    fresh = sorted(set(drawn).difference(older_names))
     if scheme.name == "random":
-        folds = [_draw_roles(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
+        folds = [_draw_roles(fresh, drawn, scheme, draw) for draw in range(scheme.repeats)]
     elif scheme.name == "blocked":
-        folds = [_assign_blocks(fresh, attributes, scheme)]
+        folds = [_assign_blocks(fresh, drawn, scheme)]
     elif scheme.name == "authors":
-        folds = _assign_author_roles(fresh, attributes, scheme)
+        folds = _assign_author_roles(fresh, drawn, scheme)
     elif scheme.name == "kfold":
-        folds = _assign_folds(fresh, attributes, scheme, keep)
+        folds = _assign_folds(fresh, drawn, scheme, keep)
     else:
-        folds = _leave_one_out(attributes, scheme, keep)
+        folds = _leave_one_out(drawn, scheme, keep)
     roles = {(name, fold): role for fold, roles_by_name in enumerate(folds) for name, role in roles_by_name.items()}
     older_roles = _older_roles(attributes, keep, len(folds), scheme)
     roles |= older_roles
+    roles = {
+        (name, fold): roles[leader, fold] for name, leader in leaders.items() for fold in range(len(folds))
+    } | roles
     if scheme.few:
         roles |= _limit_training(roles, older_roles, attributes, scheme)
+    for group, fold in itertools.product(equal, range(len(folds))):
+        decisive = [name for name in group if (name, fold) in older_roles] or group
+        role = min((roles[name, fold] for name in decisive), key=_PRECEDENCE.index)
+        roles |= {(name, fold): role for name in group if (name, fold) not in older_roles}
     for fold in range(len(folds)):
         if not any(role == "train" for (_, at), role in roles.items() if at == fold):
             raise TacpipeError(
@@ -101,6 +129,16 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
                 f"Lower val and test, or add recordings."
             )
     return dict(sorted(roles.items(), key=lambda item: (item[0][1], item[0][0])))
+
+
+def separated(roles: Mapping[tuple[str, int], str], groups: Sequence[Sequence[str]]) -> list[Sequence[str]]:
+    """Return the groups of recordings with different roles in any fold.
+
+    >>> separated({("a", 0): "train", ("b", 0): "test", ("c", 0): "test"}, [["a", "b"], ["b", "c"]])
+    [['a', 'b']]
+    """
+    folds = {fold for _, fold in roles}
+    return [group for group in groups if any(len({roles[name, fold] for name in group}) > 1 for fold in folds)]
 
 
 def without_val(roles: Mapping[tuple[str, int], str]) -> list[int]:
@@ -113,7 +151,10 @@ def without_val(roles: Mapping[tuple[str, int], str]) -> list[int]:
 
 
 def sufficient_val(
-    attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}
+    attributes: Mapping[str, Attributes],
+    scheme: Scheme,
+    keep: Mapping[tuple[str, int], str] = {},
+    equal: Sequence[Sequence[str]] = (),
 ) -> float | None:
     """Return the smallest of some larger fractions ``val`` with validation recordings in each fold, or None.
 
@@ -121,7 +162,7 @@ def sufficient_val(
     """
     for val in SHARES:
         try:
-            if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep)):
+            if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep, equal)):
                 return val
         except TacpipeError:  # such a large fraction leaves no training recordings
             continue
@@ -141,8 +182,9 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
             "on; each must be 0 or more, and their sum below 1."
         )
     if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
+        units = f"groups by {plain(scheme.group)}" if scheme.group else "recordings"
         raise TacpipeError(
-            f"{scheme.folds} folds cannot be made of {len(attributes)} recordings; folds must lie between 2 and that."
+            f"{scheme.folds} folds cannot be made of {len(attributes)} {units}; folds must lie between 2 and that."
         )
     _check_options(scheme)
 
@@ -168,6 +210,29 @@ def _check_options(scheme: Scheme) -> None:
         )
     if scheme.few_of and not all(scheme.few_of.partition("=")):
         raise TacpipeError(f"few_of is {scheme.few_of!r}; it must be an attribute and a value, as sensor=roboskin.")
+
+
+def _leaders(
+    attributes: Mapping[str, Attributes], scheme: Scheme, older_names: Collection[str], equal: Sequence[Sequence[str]]
+) -> dict[str, str]:
+    """Return the recording that is drawn for each recording, or nothing if each is drawn itself.
+
+    Recordings that share a value of ``group`` or are ``equal`` are drawn as one, directly or through others. It is the
+    first by name, or the first with a role in the older split.
+    """
+    groups: dict[object, list[str]] = {number: list(group) for number, group in enumerate(equal)}
+    for attribute in filter(None, map(str.strip, scheme.group.split(","))):
+        for name in sorted(attributes):
+            groups.setdefault((attribute, _value(name, attributes, attribute)), []).append(name)
+    members = {name: [name] for name in sorted(attributes)} if groups else {}  # recordings joined with each
+    for group in groups.values():
+        for name in group[1:]:
+            if members[name] is not members[group[0]]:
+                members[group[0]] += members[name]
+                members |= dict.fromkeys(members[name], members[group[0]])
+    return {
+        name: min(joined, key=lambda member: (member not in older_names, member)) for name, joined in members.items()
+    }
 
 
 def _draw_roles(

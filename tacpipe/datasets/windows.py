@@ -15,9 +15,10 @@ from tacpipe.arrays import AnyArray, Bools, Floats, Int64s
 from tacpipe.channels import streams
 from tacpipe.datasets import arrays
 from tacpipe.errors import UsageError
+from tacpipe.plugins.rows import IN_GAP, RowCounts, count_rows
 from tacpipe.printable import listed, plain
 from tacpipe.signals.contact import rest_level
-from tacpipe.signals.runs import run_starts, window_starts
+from tacpipe.signals.runs import rows_in_windows, run_starts, window_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -213,10 +214,8 @@ class Windows(torch.utils.data.Dataset[Window]):
         count, mean, squares = 0, np.zeros(len(self.columns)), np.zeros(len(self.columns))
         for name in self._names:
             rows = self._rows(name)
-            inside = np.zeros(len(rows.values) + 1, dtype=np.int64)
-            np.add.at(inside, rows.starts, 1)
-            np.add.at(inside, rows.starts + self.context + self.horizon, -1)
-            values = rows.values.numpy()[np.cumsum(inside)[:-1] > 0].astype(np.float64)
+            inside = rows_in_windows(rows.starts, self.context + self.horizon, len(rows.values))
+            values = rows.values.numpy()[inside].astype(np.float64)
             if len(values):  # means and squares of two parts can be added
                 difference = values.mean(axis=0) - mean
                 total = count + len(values)
@@ -283,9 +282,11 @@ class Windows(torch.utils.data.Dataset[Window]):
             values = _matrix(matrix, self.dtype, recording.name)
         else:
             values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
-        usable: Bools = ~streams.gap_mask(table) & np.isfinite(values).all(axis=1)
+        usable: Bools = ~streams.unusable_rows(table) & np.isfinite(values).all(axis=1)
         groups = np.cumsum(run_starts(t_ns, streams.max_step(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
+        inside = rows_in_windows(starts, self.context + self.horizon, len(t_ns))
+        count_rows(recording.name, self.stream, RowCounts.from_masks(inside, [(IN_GAP, ~usable)]))
         return _RecordingRows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 
 

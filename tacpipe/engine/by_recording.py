@@ -22,9 +22,10 @@ from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.plugins import registry
 from tacpipe.store import records
 from tacpipe.store.location import locate
-from tacpipe.store.records import ComputedResult, GroupIdentity, RecordingEntry, Step, StoredResult
+from tacpipe.store.records import ComputedResult, GroupIdentity, Provenance, RecordingEntry, Step, StoredResult
 from tacpipe.store.store import Store
 
+SHOWN = 100  # maximum number of recordings that are listed one by one when some could not be read
 Answer = Mapping[str, RecordingEntry] | pages.Pages  # results of a group of recordings
 
 
@@ -244,23 +245,23 @@ class ByRecording:
                 self.outcome.reused += not result.is_new
                 self.outcome.add_record(name, result.recording, result.record)
                 made_by = result.record["provenance"]
-                computed[result.recording] = {  # only the necessary fields, because there may be a million recordings
-                    "result": result.record["result"],
-                    "provenance": {
-                        "notes": made_by.get("notes", []),
-                        "code": made_by.get("code"),
-                        "packages": made_by.get("packages", {}),
-                    },
+                necessary: Provenance = {  # not the environment, because there may be a million recordings
+                    "notes": made_by.get("notes", []),
+                    "code": made_by.get("code"),
+                    "packages": made_by.get("packages", {}),
                 }
+                if "rows" in made_by:
+                    necessary["rows"] = made_by["rows"]
+                computed[result.recording] = {"result": result.record["result"], "provenance": necessary}
                 if self.request.compare and result.recording in stored:
                     self.outcome.compare(stored[result.recording], result.record, result.recording)
-        self._raise_failures(name, bad)
+        self._raise_failures(name, bad, {**stored, **computed})
         return computed
 
-    def _raise_failures(self, name: str, bad: Mapping[str, Done]) -> None:
+    def _raise_failures(self, name: str, bad: Mapping[str, Done], good: Mapping[str, ComputedResult]) -> None:
         """Add failed recordings to the outcome, and raise their error unless ``--skip-bad`` excuses it.
 
-        ``bad`` contains the failures by recording.
+        ``bad`` contains the failures by recording, and ``good`` the results.
         """
         # paths are relative, because the location of files is not part of a manifest
         source = f"{self.request.source}/"
@@ -275,13 +276,13 @@ class ByRecording:
         lock_errors = [failure.error for failure in bad.values() if failure.exit_code == LOCKED]
         if lock_errors:  # another process is computing the recording, which may be valid
             raise LockedError(lock_errors[0])
-        lines = _lines({recording: bad[recording].error for recording in bad})
+        lines = _verdicts({recording: bad[recording].error for recording in bad}, good)
         plural = "recordings" if len(bad) > 1 else "recording"
         advice = "fix these." if other_errors else "fix these, or leave them out with --skip-bad."
         raise error(
             max(failure.exit_code for failure in bad.values()),
-            f"{registry.stage_name(name)} could not read {len(bad)} {plural}:\n{lines}\nThe other recordings are kept "
-            f"in the store; {advice}",
+            f"{registry.stage_name(name)} could not read {len(bad)} {plural} of {len(bad) + len(good)}:\n{lines}\nThe "
+            f"other recordings are kept in the store; {advice}",
         )
 
 
@@ -301,6 +302,18 @@ def error(exit_code: int, sentence: str) -> TacpipeError:
     failure = TacpipeError(sentence)
     failure.exit_code = exit_code
     return failure
+
+
+def _verdicts(bad: Mapping[str, str], good: Mapping[str, ComputedResult]) -> str:
+    """Return one line per recording, with its error or its rows; of many recordings only those with errors."""
+    verdicts = dict(bad)
+    if len(bad) + len(good) <= SHOWN:
+        for recording, record in good.items():
+            entries = record["result"]["recordings"].values()
+            rows = sum(shard.get("rows", 0) for entry in entries for shard in entry["shards"].values())
+            verdicts[recording] = f"read, {rows} rows"
+    width = max(map(len, verdicts)) + 1
+    return "\n".join(f"  {f'{recording}:':<{width}} {verdicts[recording]}" for recording in sorted(verdicts))
 
 
 def _lines(bad: Mapping[str, str]) -> str:

@@ -164,7 +164,7 @@ def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack)
     A new result comes with the lease of ``key`` in ``leases``. The result of a dry task is never stored.
     """
     if task.dry:
-        result, _ = execution.execute(task, store, ScratchStore())
+        result, *_ = execution.execute(task, store, ScratchStore())
         return Done(task.recording, {"result": result, "provenance": provenance.describe_provenance(0.0)})
     leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
     record = store.record(key)
@@ -175,7 +175,7 @@ def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack)
     with registry.collect_packages() as packages:
         stage = registry.load_step(task.name)
         code = provenance.code(stage)  # read first, because the file may be edited while the stage runs
-        result, notes = execution.execute(task, store, store)
+        result, notes, rows = execution.execute(task, store, store)
     origin: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - started, 4)),
         "irreplaceable": stage.source,
@@ -183,9 +183,23 @@ def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack)
         "packages": provenance.code_of_packages(task.identity, packages),
         "notes": notes,
     }
-    if stage.source:  # until a dataset's manifest exists, only the record marks this as a recording
+    if rows is not None:
+        origin["rows"] = rows.to_json()
+    if stage.source:
+        origin["columns"] = _stored_columns(store, result)
+        # until a dataset's manifest exists, only the record marks this as a recording
         _single_manifest(task, stage, result).keep(store, durable=True)
     return _Made(result, origin, replace, stage.source)
+
+
+def _stored_columns(store: Store, result: StoredResult) -> dict[str, list[str]]:
+    """Return the names of the columns of each stream of a recording that was just stored."""
+    from tacpipe.io import parquet
+
+    (entry,) = result["recordings"].values()
+    return {
+        stream: parquet.column_names(store.object_path(shard["digest"])) for stream, shard in entry["shards"].items()
+    }
 
 
 def _single_manifest(task: WorkerTask, stage: AnyStage, result: StoredResult) -> Manifest:

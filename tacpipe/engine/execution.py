@@ -25,6 +25,7 @@ from tacpipe.io.files import Draft, Hashed, move, present, write_whole
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, registry
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.rows import RowCounts, RowTally, StageRows, tally_rows
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.location import open_store
@@ -86,14 +87,18 @@ class ScratchStore:
 
 def execute(
     task: WorkerTask, store: Store, sink: Store | ScratchStore, *, followed: bool = True
-) -> tuple[StoredResult, list[str]]:
-    """Call the stage for a task, put its content into ``sink``, and return the ``result`` of the record, and notes.
+) -> tuple[StoredResult, list[str], StageRows | None]:
+    """Call the stage for a task, put its content into ``sink``, and return the ``result`` of the record, notes and rows.
 
     With ``followed``, the progress of a training is reported to trackers and the display.
     """
     stage, stage_name = registry.load_step(task.name), registry.stage_name(task.name)
     params = params_of.from_json(stage, task.identity["params"])
-    with _arguments(stage, task, store) as arguments, _follow_training(task.name, stage, arguments if followed else {}):
+    with (
+        _arguments(stage, task, store) as arguments,
+        _follow_training(task.name, stage, arguments if followed else {}),
+        tally_rows() as tally,
+    ):
         try:
             with (
                 memory.raising_shortage(),
@@ -105,7 +110,35 @@ def execute(
             extras.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
     notes = [*returned.notes, *(note for output in returned.recordings.values() for note in output.notes)]
-    return result, notes
+    return result, notes, _counted_rows(stage, returned, result, tally)
+
+
+def _counted_rows(stage: AnyStage, returned: Result, result: StoredResult, tally: RowTally) -> StageRows | None:
+    """Return the rows that a stage read, by stream, or None if they are not counted.
+
+    Without statements of the stage, a stream was used if it, or the single table of the result, has as many rows in the
+    result. Readers of files state only what they dropped.
+    """
+    outputs: list[Result | RecordingOutput] = [returned, *returned.recordings.values()]
+    stated = [output.rows for output in outputs if output.rows is not None]
+    stated += [{stream: counts} for (_, stream), counts in tally.counts.items()]
+    if not stated and stage.argument("Recording"):
+        shards = result["recordings"][""]["shards"]
+        stored = {stream: shard.get("rows") for stream, shard in shards.items()}
+        if any(stored.get(stream, stored.get("")) != rows for (_, stream), rows in tally.opened.items()):
+            return None
+        stated = [{stream: RowCounts.all_used(rows)} for (_, stream), rows in tally.opened.items()]
+    elif not stated and (stage.source or (tally.opened and not stage.argument("Parts"))):
+        return None
+    if stage.source:
+        used = {stream: shard["rows"] for stream, shard in result["recordings"][""]["shards"].items()}
+        for stream in {*used, *tally.dropped}:
+            count, dropped = used.get(stream, 0), tally.dropped.get(stream, {})
+            stated.append({stream: RowCounts(count + sum(dropped.values()), count, dropped)})
+    total = StageRows(1)
+    for rows in stated:
+        total.add(StageRows(0, dict(rows)))
+    return total
 
 
 def _result(name: str, stage: AnyStage, returned: Any) -> Result:
@@ -289,7 +322,7 @@ def _arguments(stage: AnyStage, task: WorkerTask, store: Store) -> Iterator[dict
             arguments[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
             arguments[name] = {file: Path(path) for file, path in (task.files or {}).items()}
-        elif kind in ("Trial", "Values", "RecordingName"):
+        elif kind in ("Trial", "Values", "RecordingName", "Rows"):
             arguments[name] = inputs[name]
         elif kind == "Shared":
             arguments[name] = SharedFiles(store) if store.run else None

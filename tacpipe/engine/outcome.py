@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
 
+from tacpipe.datasets.consistency import column_notes, label_notes
 from tacpipe.engine import execution, provenance
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
+from tacpipe.plugins.rows import StageRows, stage_rows_from_json
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed
 from tacpipe.store.records import ComputedResult, Summary
 
@@ -48,6 +51,8 @@ class Outcome:
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # number of results by stage and digest of its code
     # number of results by plug-in package and digest of its code
     packages: dict[str, dict[str, int]] = field(default_factory=dict)
+    stage_rows: dict[str, StageRows] = field(default_factory=dict)  # rows read, by stage
+    columns: dict[str, dict[str, list[str]]] = field(default_factory=dict)  # names of columns by recording and stream
     unlike: list[str] = field(default_factory=list)  # differences between the computers that produced differing results
 
     def begin(self) -> None:
@@ -56,14 +61,23 @@ class Outcome:
         self.restore({})
 
     def add_record(self, stage: str, recording: str, record: ComputedResult) -> None:
-        """Add the notes of a record and the code that computed it."""
+        """Add the notes of a record, the code that computed it, and the rows that it accounts for."""
         made_by = record["provenance"]
         for note in made_by.get("notes") or ():
             self.recordings_by_note.setdefault(note, []).append(recording)
+        if columns := made_by.get("columns"):
+            self.columns[recording] = columns
         if code := made_by.get("code"):
             _add_counts(self.code, {stage: {code: 1}})
         packages = made_by.get("packages") or {}
         _add_counts(self.packages, {package: {code: 1} for package, code in packages.items()})
+        if (rows := made_by.get("rows")) is not None:
+            self.stage_rows.setdefault(stage, StageRows()).add(StageRows.from_json(rows))
+
+    def add_dataset_notes(self, attributes_by_recording: Mapping[str, Mapping[str, Attribute]]) -> None:
+        """Add notes on labels and columns that differ between the recordings of the dataset."""
+        for note in [*label_notes(attributes_by_recording), *column_notes(self.columns)]:
+            self.recordings_by_note.setdefault(note, [""])
 
     def add_group(self, summary: Summary) -> None:
         """Add the summary that `of_results` returned for a group of recordings."""
@@ -71,6 +85,8 @@ class Outcome:
             self.recordings_by_note.setdefault(note, []).extend(recordings)
         _add_counts(self.code, summary.get("code") or {})
         _add_counts(self.packages, summary.get("packages") or {})
+        for stage, rows in stage_rows_from_json(summary.get("stage_rows")).items():
+            self.stage_rows.setdefault(stage, StageRows()).add(rows)
 
     def compare(self, stored: ComputedResult, recomputed: ComputedResult, name: str) -> None:
         """Compare two records of a result, and add the differences. ``name`` is the stage or the recording."""
@@ -83,12 +99,19 @@ class Outcome:
 
     def of_results(self) -> Summary:
         """Return the summary of all added records, to be stored in the record of a run."""
-        return {"code": self.code, "packages": self.packages, "notes": self.recordings_by_note}
+        stage_rows = {stage: rows.to_json() for stage, rows in self.stage_rows.items()}
+        return {
+            "code": self.code,
+            "packages": self.packages,
+            "notes": self.recordings_by_note,
+            "stage_rows": stage_rows,
+        }
 
     def restore(self, summary: Summary) -> None:
         """Restore a summary that `of_results` returned; older records contain none."""
         self.code, self.packages = summary.get("code") or {}, summary.get("packages") or {}
         self.recordings_by_note = summary.get("notes") or {}
+        self.stage_rows = stage_rows_from_json(summary.get("stage_rows"))
 
     def describe_differences(self) -> str:
         """Describe the differences from the stored results, and whether rounding on another computer may explain them."""
@@ -96,7 +119,7 @@ class Outcome:
         return f"these differ from what is stored: {'; '.join(self.differs)}{computers}"
 
     def describe_results(self) -> list[str]:
-        """Return the notes of stages, and warnings about results that an earlier version of the code computed."""
+        """Return the notes of stages, unused rows, and warnings about results of an earlier version of the code."""
         count = self.ran + self.reused
         lines = []
         for text, names in self.recordings_by_note.items():
@@ -105,6 +128,8 @@ class Outcome:
                 some_recordings = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
                 subject = f"all {count} recordings" if len(names) == count else some_recordings
             lines.append(f"{subject}: {text}" if subject else text)
+        sentences = (rows.describe_unused(registry.stage_name(stage)) for stage, rows in self.stage_rows.items())
+        lines += [sentence for sentence in sentences if sentence]
         described_packages = set()
         for stage, counts in self.code.items():
             if warning := _other_code(stage, counts):

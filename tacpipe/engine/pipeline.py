@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.datasets import manifest, replacing, selection
+from tacpipe.datasets import labels, lineage, manifest, replacing, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.paths import shard_path
@@ -95,7 +95,13 @@ def existing_outcome(request: Request) -> Outcome | None:
 
 
 def _conclude(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread, started: float) -> Outcome:
-    outcome.notes = [*sorted(set(inputs.notes)), *inputs.describe_unread(), *outcome.describe_results(), *outcome.notes]
+    outcome.notes = [
+        *sorted(set(inputs.notes)),
+        *inputs.describe_unread(),
+        *inputs.describe_findings(),
+        *outcome.describe_results(),
+        *outcome.notes,
+    ]
     outcome.rows = result.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
@@ -205,6 +211,8 @@ class _RequestRun:
             if self.store.run:  # `explain` and `gc` trace a dataset to the manifests that it was computed from
                 source_manifest.keep(self.store)
         result = self._make()
+        if self.stage.source:  # a training prints what concerns it with its findings
+            self.outcome.add_dataset_notes(labels.attributes(result))
         try:
             manifest.check_pages(result, fresh=True)
         except (ValueError, TypeError, KeyError) as error:
@@ -224,6 +232,7 @@ class _RequestRun:
                 for name, kind in stage.arguments.items()
                 if kind != "Workspace"
             }
+            inputs |= {"equal": self.inputs.equal_recordings} if self.inputs.equal_recordings else {}
             identity = keys.identity(request.name, stage.version, request.params, inputs)
             if stage.part is not None:
                 files = {**self._run_whole(request.name, identity, counted=False)["files"], **self._parts.files}
@@ -338,6 +347,8 @@ class _RequestRun:
             return keys.of_dataset(inputs.model, None, {})
         if kind == "Datasets":
             return [keys.of_dataset(dataset.manifest, reads, dataset.manifest.included) for dataset in inputs.datasets]
+        if kind == "Rows":
+            return [lineage.chain_rows(self.store, dataset.manifest, dataset.digest) for dataset in inputs.datasets]
         if kind == "Roles":
             return self._roles(name)
         if kind == "Parts":

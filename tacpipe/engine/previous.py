@@ -22,6 +22,7 @@ from tacpipe.engine.outcome import Outcome
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
+from tacpipe.plugins.rows import StageRows, stage_rows_from_json
 from tacpipe.store import records
 from tacpipe.store.presence import Head, Look, Note
 from tacpipe.store.records import RecordingEntry, RunIdentity, Step, Summary
@@ -118,18 +119,20 @@ class Previous:
         """Return the summary of all results except those of the ``replaced`` groups, or None if it is unknown.
 
         ``count`` is the number of the other results. Records of the replaced results are read only if the earlier run
-        has results of different code.
+        has results of different code, or counted rows.
         """
         earlier = _counts_by_code(self.summary, step["stage"])
         if any(sum(counts.values()) != len(self.result.recordings) for counts in earlier.values()):
             return None
         replaced_counts: list[_CountsByCode] = []
-        if any(len(counts) > 1 for counts in earlier.values()):
+        rows = stage_rows_from_json(self.summary.get("stage_rows"))
+        if rows or any(len(counts) > 1 for counts in earlier.values()):
             for group in replaced:
                 summary = self._group_summary(step, group.entries())
                 if summary is None:
                     return None
                 replaced_counts.append(_counts_by_code(summary, step["stage"]))
+                rows = _subtract_rows(rows, stage_rows_from_json(summary.get("stage_rows")))
         remaining: _CountsByCode = {}
         for source, counts in earlier.items():
             remaining[source] = _subtract(counts, [part.get(source, {}) for part in replaced_counts], count)
@@ -145,6 +148,7 @@ class Previous:
             "code": {name: counts for (kind, name), counts in remaining.items() if kind == "code" and counts},
             "packages": {name: counts for (kind, name), counts in remaining.items() if kind == "packages" and counts},
             "notes": {note: names for note, names in notes.items() if names},
+            "stage_rows": {stage: counted.to_json() for stage, counted in rows.items()},
         }
 
     def _group_summary(self, step: Step, entries: Mapping[str, RecordingEntry]) -> Summary | None:
@@ -182,6 +186,16 @@ def _subtract(counts: Mapping[str, int], replaced: Sequence[Mapping[str, int]], 
     for replaced_counts in replaced:
         remaining.subtract(replaced_counts)
     return {code: number for code, number in remaining.items() if number}
+
+
+def _subtract_rows(rows: dict[str, StageRows], replaced: Mapping[str, StageRows]) -> dict[str, StageRows]:
+    """Return the rows of the results that are not ``replaced``, or none if records were computed again in between."""
+    try:
+        for stage, counted in replaced.items():
+            rows[stage].subtract(counted)
+    except (KeyError, TacpipeError):
+        return {}
+    return rows
 
 
 def inputs(store: Store, note: Note) -> Sequence[str]:

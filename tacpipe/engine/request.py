@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from tacpipe.datasets import manifest, paths, selection
+from tacpipe.datasets import manifest, pages, paths, selection
 from tacpipe.datasets.manifest import VALUES, Found, InputDataset, Manifest
 from tacpipe.datasets.replacing import ResultPlan
 from tacpipe.engine import execution
@@ -110,7 +110,7 @@ class RequestInputs:
         A rerun is answered from it without opening a shard.
         """
         fit = self.stage.fit
-        return {
+        identity: RunIdentity = {
             "run": self.request.name,
             "version": [self.stage.version, fit.version if fit else None],
             "params": params_of.to_json(self.request.params),
@@ -120,6 +120,25 @@ class RequestInputs:
             "fold": self.request.fold,
             "role": self.request.role,
         }
+        if self.equal_recordings:
+            identity["equal"] = self.equal_recordings
+        return identity
+
+    @cached_property
+    def equal_recordings(self) -> Sequence[Sequence[str]]:
+        """Groups of recordings with equal content, if the stage must not separate them and would; else none.
+
+        They are part of a key only then, so other keys stay as they are.
+        """
+        separated = getattr(self.request.params, "separated", None)
+        groups = selection.equal_recordings(self.merged.included) if separated is not None else []
+        if not groups or separated is None:
+            return []
+        attributes = {
+            name: entry["attributes"] for part in pages.parts(self.merged.included) for name, entry in part.items()
+        }
+        older = self.named_datasets.get("extend")
+        return groups if separated(attributes, {} if older is None else self._read_roles(older), groups) else []
 
     def describe_unread(self) -> list[str]:
         """Return sentences about files below the source that are not part of a recording."""
@@ -134,6 +153,23 @@ class RequestInputs:
         from tacpipe.formats import container
 
         return container.describe_unread(self.request.source, read_paths, reason, self.request.output)
+
+    def describe_findings(self) -> list[str]:
+        """Return at most one line on labels and equal recordings that concern a training or an evaluation."""
+        trains = self.request.name.startswith(registry.PREFIXES[registry.TASKS])
+        if not trains and not (self.stage.reads_model and self.stage.headline):
+            return []
+        from tacpipe.checks import roles
+
+        stage = self.stage if trains else registry.stages().get(self.model.stage) and registry.load(self.model.stage)
+        requirements = stage.requirements if stage else None
+        labels = {label.name for label in requirements.labels} if requirements else set()
+        labels |= {getattr(self.request.params, "label", "")}
+        recordings = self.merged.included
+        equal = selection.equal_recordings(recordings) if "split" in self.named_datasets else []
+        attributes = {name: entry["attributes"] for part in pages.parts(recordings) for name, entry in part.items()}
+        sentence = roles.describe(attributes, sorted(labels), equal, self.roles if equal else {})
+        return [sentence] if sentence else []
 
     def plan(self) -> ResultPlan:
         """Return the properties of the result that are known before it is computed."""
@@ -187,11 +223,15 @@ class RequestInputs:
             raise UsageError(
                 f"{self.request.name} must know which recordings to train on: give --split, as made by `tacpipe split`."
             )
-        split_path = str(split.directory)
-        content = execution.reader(self.store, (split_path,))(
-            selection.split_digest(split.manifest, split_path), selection.SPLIT_FILE
+        return selection.roles_in_fold(self._read_roles(split), self.request.fold, str(split.directory))
+
+    def _read_roles(self, split: Found) -> dict[tuple[str, int], str]:
+        """Return the role by (recording, fold) in a split. Raises `UsageError` for any other dataset."""
+        place = str(split.directory)
+        content = execution.reader(self.store, (place,))(
+            selection.split_digest(split.manifest, place), selection.SPLIT_FILE
         )
-        return selection.roles_in_fold(selection.read_roles(content), self.request.fold, split_path)
+        return selection.read_roles(content)
 
     def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, RecordingEntry]:
         """Return the recordings of ``source`` with this role. Raises `UsageError` if there are none, unless ``may_lack``."""

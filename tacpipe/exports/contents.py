@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from tacpipe.channels import schema, streams
+from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.printable import plain
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
+NOT_CARRIED = "not carried by the format"  # reason of unused rows
 TABLE = "data"  # name of a recording's only table where a name is required
 TIME = "t_ns"
 COLUMNS, STREAMS, LOSSES = "columns", "streams", "losses"  # tables of a part
@@ -112,6 +114,9 @@ def part(
         first_and_last_ns = (int(t_ns[0]), int(t_ns[-1])) if t_ns is not None else (None, None)
         rows.append((name, table.num_rows, *first_and_last_ns, rate_hz, has_nan))
     all_losses = list(losses)
+    for name, count, *_ in rows:
+        is_carried = carried is None or any(stream == name and column != TIME for stream, column in carried)
+        count_rows(recording.name, name, RowCounts.some_used(count, count * is_carried, NOT_CARRIED))
     if carried is not None:
         all_losses += unwritten_losses([(stream, column) for stream, column, *_ in columns], carried, all_losses)
     return {

@@ -110,6 +110,7 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
             **mark,
             **xela.authors_role(params.authors_role),
         },
+        rows={},
     )
 
 

@@ -21,14 +21,14 @@ import importlib
 import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 from tacpipe.errors import UsageError
+from tacpipe.io import config_text, regular
 from tacpipe.io import files as file_system
-from tacpipe.io import regular
-from tacpipe.plugins.constraints import Rate
+from tacpipe.plugins.constraints import NonNegativeFloat, NonNegativeInt, Rate
 from tacpipe.plugins.stage import Attribute, Values
 from tacpipe.printable import listed, plain
 
@@ -51,6 +51,29 @@ class Time:
     start: str = ""
     file: str = ""  # pattern of a file with the timestamps of all rows
     format: str = ""  # strptime format of text timestamps, such as %d.%m.%Y %H:%M:%S.%f; without %Y, times of day
+    batch: bool = False  # rows arrive in batches: timestamps are arrivals, and ``rate_hz`` is the declared rate
+    wrap: NonNegativeFloat = 0.0  # value at which the counter starts again from 0, in ``unit``; 0 for none
+    offset_s: float = 0.0  # added to each timestamp
+    sort: bool = False  # sort rows by timestamp
+    split_at_reset: bool = False  # each stretch between two settings of the clock is a recording
+    drop_first: NonNegativeInt = 0  # number of first rows to leave out
+    ambiguous: Literal["", "earlier", "later"] = ""  # reading of local times that summer time repeats
+
+    def entry(self, **changes: Any) -> str:
+        """Return the time as an entry of a layout, with some fields changed. The unit of numbers is always written.
+
+        >>> Time("t", "ms").entry(batch=True)
+        '{ column = "t", unit = "ms", batch = true }'
+        """
+        values = {**self.__dict__, **changes}
+        has_unit = bool(self.column or self.file) and not self.format
+        written = {
+            field.name: values[field.name]
+            for field in fields(self)
+            if values[field.name] != field.default or (field.name == "unit" and has_unit)
+        }
+        whole = {name: int(value) for name, value in written.items() if type(value) is float and value.is_integer()}
+        return config_text.toml_value(written | whole)
 
     @property
     def is_text(self) -> bool:
@@ -90,6 +113,8 @@ class SourceStream:
     time: Time
     content: pa.Table | Batched  # all rows, or only the first rows in a preview
     rows: int | None = None  # number of rows, if known in a preview
+    arrivals: str = ""  # column with the arrival times of the rows, empty if there is none
+    dropped: Mapping[str, int] = field(default_factory=dict)  # rows of the file that the content lacks, by reason
 
     @property
     def schema(self) -> pa.Schema:

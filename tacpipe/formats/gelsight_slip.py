@@ -57,4 +57,4 @@ def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
         streams[stream] = read_stream(trial_files[name], frames, frames.times_ns(), frames.stamp_origin())
     label = next(iter(files)).split("/", 1)[0]
     attributes: dict[str, Attribute] = {"sensor": "gelsight-mini", "object": label, "slip": SLIP in trial_files}
-    return RecordingOutput(streams, {**attributes, **published_attribute("gelsight-slip")})
+    return RecordingOutput(streams, {**attributes, **published_attribute("gelsight-slip")}, rows={})

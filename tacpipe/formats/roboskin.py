@@ -120,6 +120,7 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
             **published.published_attribute("roboskin"),
             **_role_attribute(block),
         },
+        rows={},
     )
 
 

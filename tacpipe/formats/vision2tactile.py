@@ -95,6 +95,7 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
             **published.published_attribute("vision2tactile", t_ns),
             **({"duplicate_of": twins[0]} if twins else {}),
         },
+        rows={},
     )
 
 

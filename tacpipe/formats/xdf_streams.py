@@ -15,23 +15,23 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray, Floats, Int64s, Times
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats import container, xdf_chunks
+from tacpipe.formats import container, xdf_chunks, xdf_restarts
 from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, DamagedChunk
+from tacpipe.formats.xdf_times import is_valid, recorder_times
 from tacpipe.io import regular
 from tacpipe.io.spill import Piece, Spill, unpack
 from tacpipe.plugins.stage import Attribute
-from tacpipe.printable import excerpt, plain
-from tacpipe.signals import clocks
+from tacpipe.printable import plain
 
 RECORDER_TIME, SENDER_TIME = "lsl_ns", "t_device_ns"  # names of columns
 OFFSETS_SUFFIX = " clock offsets"  # appended to a stream's name, it names the stream of its clock offsets
@@ -43,7 +43,7 @@ INFLATE_BYTES = 1 << 20  # maximum number of bytes decompressed at once
 
 
 @dataclass
-class _StreamReading:
+class StreamReading:
     """The samples, timestamps and clock offsets of a stream that have been read so far."""
 
     about: lsl.LslDescription
@@ -58,6 +58,8 @@ class _StreamReading:
     rows: int = 0
     missing: int = 0  # number of samples in incomplete chunks
     declared_rows: int | None = None  # number of samples according to the footer
+    t_ns: Times = field(default_factory=lambda: np.zeros(0, np.int64))  # (sample,), times on the recorder's clock
+    fit: Mapping[str, Attribute] = field(default_factory=dict)  # properties of the fit of the clock offsets
 
     def add_samples(self, content: bytes) -> None:
         """Add the samples of a chunk. Omitted timestamps continue at the stream's rate."""
@@ -113,7 +115,7 @@ class _FileReading:
     """The streams, header and damage of a file."""
 
     spill: Spill = field(default_factory=Spill)
-    streams: dict[int, _StreamReading] = field(default_factory=dict)
+    streams: dict[int, StreamReading] = field(default_factory=dict)
     headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
     unreadable: dict[int, str] = field(default_factory=dict)  # stream -> reason why its description cannot be read
     header: bytes = b""
@@ -162,32 +164,40 @@ class XdfFile:
         """
         reading = self._read()
         sources_by_number = _stream_sources(reading.streams)
+        notes = reading.notes(self.path)
+        skipped = {f"stream {number}": reason for number, reason in reading.unreadable.items() if reason != UNDESCRIBED}
+        timed: dict[int, StreamReading] = {}
+        for number, stream in reading.streams.items():
+            times = recorder_times(stream) if stream.rows else "it has no samples"
+            if isinstance(times, str):
+                skipped[sources_by_number[number]] = times
+                continue
+            stream.t_ns, stream.fit, remarks = times
+            timed[number] = stream
+            remarks += _describe_losses(stream)
+            notes += [f"{self.path}: {plain(sources_by_number[number])} {remark}" for remark in remarks]
+        groups = xdf_restarts.join_restarts(timed)
+        notes += [f"{self.path}: {note}" for note in xdf_restarts.describe_groups(timed, groups, sources_by_number)]
+        for group in groups:
+            name = timed[group[0]].about.name
+            if len(group) == sum(stream.about.name == name for stream in reading.streams.values()) > 1:
+                sources_by_number |= dict.fromkeys(group, name)
+        suffixes = ("", OFFSETS_SUFFIX)
         names = container.identifiers(
-            [name for source in sources_by_number.values() for name in (source, source + OFFSETS_SUFFIX)]
+            [source + suffix for source in dict.fromkeys(sources_by_number.values()) for suffix in suffixes]
         )
         streams: list[SourceStream] = []
         attributes = _file_attributes(reading.header)
-        notes = reading.notes(self.path)
-        skipped = {f"stream {number}": reason for number, reason in reading.unreadable.items() if reason != UNDESCRIBED}
-        for number, source in sources_by_number.items():
-            stream = reading.streams[number]
-            if not stream.rows:
-                skipped[source] = "it has no samples"
-                continue
-            times = _recorder_times(stream)
-            if isinstance(times, str):
-                skipped[source] = times
-                continue
-            notes += [
-                f"{self.path}: {plain(source)} {remark}" for remark in [*times.remarks, *_describe_losses(stream)]
-            ]
-            attributes |= {f"{names[source]}_{name}": value for name, value in times.attributes.items()}
-            content = _stream_content(stream, times.t_ns)
-            streams.append(SourceStream(source, names[source], Time(RECORDER_TIME, "ns"), content, stream.rows))
-            if stream.offsets:
-                offsets, offsets_source = _offsets_table(stream), source + OFFSETS_SUFFIX
-                name = names[offsets_source]
-                streams.append(SourceStream(offsets_source, name, Time(RECORDER_TIME, "ns"), offsets, offsets.num_rows))
+        for group in groups:
+            source, parts = sources_by_number[group[0]], [timed[number] for number in group]
+            longest = max(parts, key=lambda part: part.rows)
+            attributes |= {f"{names[source]}_{name}": value for name, value in longest.fit.items()}
+            contents = {source: _joined([_stream_content(part) for part in parts])}
+            if offsets := [_offsets_table(part) for part in parts if part.offsets]:
+                contents[source + OFFSETS_SUFFIX] = pa.concat_tables(offsets).sort_by(RECORDER_TIME)
+            for name, content in contents.items():
+                rows = content.rows if isinstance(content, Batched) else content.num_rows
+                streams.append(SourceStream(name, names[name], Time(RECORDER_TIME, "ns"), content, rows))
         selected = [stream for stream in streams if sources is None or stream.source in sources]
         return EpisodeContents(selected, attributes, skipped, notes)
 
@@ -270,7 +280,7 @@ def _store_description(reading: _FileReading, stream: int, chunk: Chunk, path: P
     if first_header is None:
         reading.headers[stream] = chunk.content
         try:
-            reading.streams[stream] = _StreamReading(lsl.parse(chunk.content), reading.spill)
+            reading.streams[stream] = StreamReading(lsl.parse(chunk.content), reading.spill)
         except TacpipeError as error:
             reading.unreadable[stream] = str(error)
     elif first_header != chunk.content:
@@ -289,7 +299,7 @@ def _sample_count(footer: bytes) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def _stream_sources(streams: Mapping[int, _StreamReading]) -> dict[int, str]:
+def _stream_sources(streams: Mapping[int, StreamReading]) -> dict[int, str]:
     """Return the source name of each stream: its name, with its number if the name is not unique."""
     names = {number: stream.about.name or stream.about.kind or f"stream {number}" for number, stream in streams.items()}
     name_list = list(names.values())
@@ -305,7 +315,7 @@ def _file_attributes(header: bytes) -> dict[str, Attribute]:
     return {"recorded_at": stamp} if stamp else {}
 
 
-def _describe_losses(stream: _StreamReading) -> list[str]:
+def _describe_losses(stream: StreamReading) -> list[str]:
     """Return sentences about the missing samples of a stream."""
     losses = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
     if stream.declared_rows is not None and stream.declared_rows != stream.rows:
@@ -313,77 +323,20 @@ def _describe_losses(stream: _StreamReading) -> list[str]:
     return losses
 
 
-class _RecorderTimes(NamedTuple):
-    """The times of a stream's samples on the recorder's clock."""
+def _joined(contents: Sequence[pa.Table | Batched]) -> pa.Table | Batched:
+    """Return the samples of the parts of a stream, in their order."""
+    if not any(isinstance(content, Batched) for content in contents):
+        return pa.concat_tables(contents)
 
-    t_ns: Times  # (sample,)
-    attributes: dict[str, Attribute]  # properties of the fit of the clock offsets
-    remarks: list[str]
+    def read() -> Iterator[pa.Table]:
+        for content in contents:
+            yield from content.read() if isinstance(content, Batched) else [content]
 
-
-def _recorder_times(stream: _StreamReading) -> _RecorderTimes | str:
-    """Return the times of a stream's samples, or the reason why they cannot be determined."""
-    raw_s = np.concatenate(stream.stamps)
-    is_time = np.abs(raw_s) < lsl.MAX_TIME_S
-    if not is_time.all():
-        return f"its stamp {excerpt(float(raw_s[~is_time][0]))} is not a time in seconds"
-    raw_ns = lsl.nanoseconds(raw_s)
-    measured = _valid_offsets(stream)
-    attributes: dict[str, Attribute] = {}
-    remarks: list[str] = []
-    t_ns = raw_ns
-    if len(measured):
-        lines = clocks.fit_offsets(measured[:, 0], measured[:, 1])
-        starts = [0, *(_reset_row(stream, raw_ns, measured, line.start) for line in lines[1:])]
-        t_ns = clocks.convert_by_segment(lines, starts, raw_ns)
-        longest = max(lines, key=lambda line: line.stop - line.start)
-        attributes = {"lsl_drift_ppm": round(longest.drift * 1e6, 3), "lsl_clock_resets": len(lines) - 1}
-    else:
-        remarks.append("has no clock offsets: its stamps are taken for the recorder's.")
-    back_ns = np.maximum.accumulate(t_ns) - t_ns
-    if back_ns.any():
-        rows = int(np.count_nonzero(back_ns))
-        if not len(measured) and back_ns.max() > clocks.STEP_NS and rows > len(t_ns) // 2:
-            row = int(back_ns.argmax())
-            return (
-                f"its clock went back by {back_ns[row] / 1e9:.6g} s at sample {row + 1}, and no clock offset states by how "
-                "much it was set"
-            )
-        remarks.append(
-            f"has {rows:,} stamps before the one above, by up to {back_ns.max() / 1e9:.6g} s: t_ns has that one for them."
-        )
-    return _RecorderTimes(t_ns + back_ns, attributes, remarks)
+    rows = sum(content.rows if isinstance(content, Batched) else content.num_rows for content in contents)
+    return Batched(contents[0].schema, rows, read)
 
 
-def _valid_offsets(stream: _StreamReading) -> Int64s:
-    """Return the finite clock offsets in ns, shape (measurement, reading and offset)."""
-    offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
-    return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_is_valid(offsets_s)].T])
-
-
-def _is_valid(offsets_s: Floats) -> AnyArray:
-    return np.asarray((np.abs(offsets_s) < lsl.MAX_TIME_S).all(axis=1))
-
-
-def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: int) -> int:
-    """Return the first sample after the sender's clock was reset. ``first`` is the first measurement after the reset.
-
-    The sample is between that measurement and the previous one or, because samples are written late, just after it.
-    """
-    valid_rows = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
-    rows = [*(stream.rows_before[row] for row in valid_rows.tolist()), len(raw_ns)]
-    low, high = rows[first - 1], min(rows[first + 1], len(raw_ns))
-    steps = np.diff(raw_ns[max(low - 1, 0) : high])
-    if not len(steps):
-        return min(rows[first], len(raw_ns))
-    jump = int(np.abs(steps - np.median(steps)).argmax())
-    expected = measured[first, 0] - measured[first - 1, 0]
-    if abs(int(steps[jump])) < abs(int(expected)) / 2 and (steps >= 0).all():
-        return min(rows[first], len(raw_ns))  # no sample shows the reset, because none was sent in between
-    return max(low - 1, 0) + jump + 1
-
-
-def _stream_content(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
+def _stream_content(stream: StreamReading) -> pa.Table | Batched:
     """Return the samples with their timestamps: a table if there are few, else batches from the spill file."""
     schema = pa.schema([_time_field(RECORDER_TIME), _time_field(SENDER_TIME), *stream.fields])
     raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
@@ -392,7 +345,7 @@ def _stream_content(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
         start = 0
         for columns in stream.channels():
             stop = start + len(columns[0])
-            yield pa.table([pa.array(t_ns[start:stop]), pa.array(raw_ns[start:stop]), *columns], schema)
+            yield pa.table([pa.array(stream.t_ns[start:stop]), pa.array(raw_ns[start:stop]), *columns], schema)
             start = stop
 
     return Batched(schema, stream.rows, read) if stream.pieces else next(read())
@@ -403,10 +356,10 @@ def _time_field(name: str) -> pa.Field:
     return pa.field(name, pa.int64(), metadata={"unit": "ns", "quantity": "time", "clock": clock})
 
 
-def _offsets_table(stream: _StreamReading) -> pa.Table:
+def _offsets_table(stream: StreamReading) -> pa.Table:
     """Return the measured clock offsets: the times on both clocks and the offset to add."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
-    offsets_s = offsets_s[_is_valid(offsets_s)]
+    offsets_s = offsets_s[is_valid(offsets_s)]
     sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)
     field = pa.field("offset_s", pa.float64(), metadata={"unit": "s", "quantity": "time"})
     columns = [pa.array(np.maximum.accumulate(sent_ns + offset_ns)), pa.array(sent_ns), pa.array(offsets_s[:, 1])]

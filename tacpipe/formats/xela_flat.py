@@ -88,6 +88,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
             **published.published_attribute("xela-flat", meta.utc_ns("start_time")),
             **xela.authors_role(params.authors_role),
         },
+        rows={},
     )
 
 

@@ -85,6 +85,7 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
             "marker_unseen_ratio": round(unseen, 4),
             **xela.authors_role(params.authors_role),
         },
+        rows={},
     )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from tacpipe.arrays import Bools
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 
 BLOCK_BYTES = 1 << 24  # approximate number of bytes decoded at once
@@ -95,10 +96,31 @@ class Columns:
             self._decoded, self._places = pa.table({}), {}
 
 
+class SelectedRows:
+    """The columns of a stream without some of its rows, with the part of the interface of `Columns` that reads rows."""
+
+    def __init__(self, columns: Columns, mask: Bools) -> None:
+        """Select the rows of ``columns`` for which ``mask`` (row,) is True."""
+        self._columns, self._mask = columns, mask
+        self.schema, self.row_bytes, self.column_names = columns.schema, columns.row_bytes, columns.column_names
+        self.num_rows = int(mask.sum())
+
+    def column(self, name: str) -> pa.ChunkedArray:
+        """Return one column."""
+        return self._columns.column(name).filter(pa.array(self._mask))
+
+    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Yield tables of consecutive rows, with only ``columns``."""
+        first = 0
+        for table in self._columns.batches(columns):
+            yield table.filter(pa.array(self._mask[first : first + table.num_rows]))
+            first += table.num_rows
+
+
 class RowRanges:
     """Decodes ranges of a stream's rows that move forward and may overlap; each row is decoded once."""
 
-    def __init__(self, columns: Columns) -> None:
+    def __init__(self, columns: Columns | SelectedRows) -> None:
         self._batches = columns.batches()
         self._pieces: list[pa.Table] = []  # decoded rows up to ``_stop``
         self._stop = 0

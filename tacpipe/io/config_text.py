@@ -8,18 +8,63 @@ that it refers to.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from tacpipe.printable import plain
 
+_PLAIN = "tacpipe/plain"  # tag of text without quotes
 MAX_DEPTH = 50  # maximum nesting depth of lists and mappings
 MAX_VALUES = 100_000  # maximum number of values, including expanded aliases
 MAX_CHARACTERS = 10_000_000  # maximum length of the text
 
 
-def load_yaml(content: str | bytes) -> Any:
-    """Return the value of a YAML document.
+def plain_value(text: str) -> str | int | float | bool | None:
+    """Return the value of a text: true, false, a number if it is written as one, None if empty, else the text.
+
+    A number with leading zeros is text, because it is usually a name.
+
+    >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan", "no", "12:30:45")]
+    [3, 0.5, '007', True, 'cork', None, 'nan', 'no', '12:30:45']
+    """
+    stripped = text.strip()
+    if stripped.lower() in ("true", "false"):
+        return stripped.lower() == "true"
+    if not stripped:
+        return None
+    digits = stripped.lstrip("-")
+    if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
+        return int(stripped) if len(digits) < 19 else stripped
+    try:
+        number = float(stripped)
+    except ValueError:
+        return stripped
+    is_number = math.isfinite(number) and not digits.startswith("00") and "_" not in stripped and not digits.isdigit()
+    return number if is_number else stripped
+
+
+def load_labels(content: str) -> Any:
+    """Return the value of a YAML document of labels: text without quotes is read by `plain_value`, or null.
+
+    Raises the errors of `load_yaml`.
+
+    >>> load_labels("{a: no, b: 010, c: 12:30:45, d: 2, e: '2', f: null, g: 2024-05-01}")
+    {'a': 'no', 'b': '010', 'c': '12:30:45', 'd': 2, 'e': '2', 'f': None, 'g': '2024-05-01'}
+    """
+
+    def parse_plain(text: str) -> str | int | float | bool | None:
+        if text in ("~", "null", "Null", "NULL"):
+            return None
+        return (
+            float(text.replace(".", "", 1)) if text.lower() in (".nan", ".inf", "-.inf", "+.inf") else plain_value(text)
+        )
+
+    return load_yaml(content, parse_plain)
+
+
+def load_yaml(content: str | bytes, parse_plain: Callable[[str], Any] | None = None) -> Any:
+    """Return the value of a YAML document; ``parse_plain`` replaces YAML's own reading of text without quotes.
 
     Raises `ValueError` with a one-line reason if the text is not YAML or is too large.
     """
@@ -44,6 +89,12 @@ def load_yaml(content: str | bytes) -> Any:
                     keys.add(key)
             return super().construct_mapping(node, deep)
 
+        def resolve(self, kind: Any, value: Any, implicit: Any) -> Any:
+            is_plain = kind is yaml.ScalarNode and implicit[0] and value != "<<"
+            return _PLAIN if is_plain and parse_plain is not None else super().resolve(kind, value, implicit)
+
+    if parse_plain is not None:
+        Loader.add_constructor(_PLAIN, lambda _, node: parse_plain(node.value))
     try:
         _refuse_large(yaml.parse(content, Loader=base_loader))
         return yaml.load(content, Loader=Loader)

@@ -7,6 +7,7 @@ import errno
 import os
 import resource
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -185,32 +186,52 @@ def require_block(size: int, source: str) -> None:
         )
 
 
+_bounds: list[int] = []  # limits of the blocks that run now, in any thread
+_bounds_lock = threading.Lock()
+_unbounded = resource.RLIM_INFINITY  # limit of the process without them
+
+
+def _set_bounds(*, added: int | None = None, removed: int | None = None) -> None:
+    """Add or remove the limit of a block, and set the limit of the process to the smallest one."""
+    global _unbounded
+    with _bounds_lock:
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        if not _bounds:
+            _unbounded = soft
+        if added is not None:
+            _bounds.append(added)
+        if removed is not None:
+            _bounds.remove(removed)
+        limits = [limit for limit in (*_bounds, _unbounded, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_DATA, (min(limits) if _bounds else _unbounded, hard))
+
+
 @contextlib.contextmanager
 def bounded(max_bytes: int, source: str) -> Iterator[None]:
     """Raise `TacpipeError` if the block allocates more than ``max_bytes``, on Linux.
 
-    This is for libraries that unpack files without checking the unpacked size.
+    This is for libraries that unpack files without checking the unpacked size. Blocks of several threads may overlap.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     try:
         limit = int(STATM.read_text().split()[5]) * resource.getpagesize() + max_bytes
     except (OSError, ValueError, IndexError):
         yield
         return
-    limit = min(bound for bound in (limit, soft, hard) if bound != resource.RLIM_INFINITY)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+    _set_bounds(added=limit)
+    failure: Exception | None = None
     try:
         yield
     except Exception as error:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-        if isinstance(error, MemoryError) or "alloc" in str(error).lower():
-            raise TacpipeError(
-                f"{source} unpacks to more than {readable_size(max_bytes)}, which is more than it declares or than is "
-                "read at once. If its source is untrusted, do not use it."
-            ) from error
-        raise
+        failure = error
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        _set_bounds(removed=limit)
+    if isinstance(failure, MemoryError) or (failure is not None and "alloc" in str(failure).lower()):
+        raise TacpipeError(
+            f"{source} unpacks to more than {readable_size(max_bytes)}, which is more than it declares or than is read at "
+            "once. If its source is untrusted, do not use it."
+        ) from failure
+    if failure is not None:
+        raise failure
 
 
 def readable_size(count: int) -> str:

@@ -268,6 +268,11 @@ class ParquetTable:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
 
 
+def column_names(path: str) -> list[str]:
+    """Return the names of the columns of a stored table, which is read from its end only."""
+    return list(pq.read_schema(path).names)
+
+
 def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
     """Return the rows of a Parquet file on disk as batches of up to ``rows`` rows, decoded on demand.
 

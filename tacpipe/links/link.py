@@ -29,6 +29,7 @@ SCHEMES = {
     "mjpeg": "mjpeg:http://192.168.1.20:8080/stream",
     "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
+DATAGRAM_SCHEMES = ("udp", "tcp+udp")
 MAX_LENGTH = 4096  # maximum number of characters of a target, which is the limit of a path
 Arrived = list[tuple[int, bytes]]  # (arrival on the monotonic clock in ns, bytes)
 

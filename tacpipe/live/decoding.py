@@ -130,7 +130,7 @@ class BatchColumns:
 
 def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
     """Return the recorded schema of a stream, with a device clock if ``device``, and with the columns ``counters``."""
-    return pa.schema([schemas.time_field(), *schemas.device_fields(clock=device, counters=counters), *sensor.fields()])
+    return pa.schema([sensor.time_field(), *schemas.device_fields(clock=device, counters=counters), *sensor.fields()])
 
 
 def likely_schema(sensor: Sensor) -> pa.Schema:

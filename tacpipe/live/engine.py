@@ -55,6 +55,11 @@ class Engine(ABC):
         return 0
 
     @property
+    def states(self) -> dict[str, str]:
+        """Facts on the session for its summary, such as which streams were late, by name."""
+        return {}
+
+    @property
     def beginning(self) -> Continuation | None:
         """The state with which another process can continue the recording, or None if there is none yet."""
         return None

@@ -133,7 +133,7 @@ class Loop:
             "overflows": self.engine.overflows,
             "dropped": self.publishers.dropped,
             "cause": self.cause,
-            "states": dict(self.publishers.states),
+            "states": {**self.publishers.states, **self.engine.states},
             "cpu_s": round(time.process_time(), 3),
             "latency": self.latencies.figures(),
             "above_10_ms": self.latencies.above(10.0),

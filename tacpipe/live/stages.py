@@ -18,8 +18,6 @@ from tacpipe.store.records import Step
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
 from tacpipe.video.stream import read_format
 
-# earlier versions whose params today's stage reads and whose rows it reproduces
-EARLIER_VERSIONS = {"synchronize": (2,)}
 CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.difference": lambda params, place: DifferenceChannels(
         params.rows, params.columns, params.reference_frames
@@ -32,10 +30,12 @@ def stage_params(step: Step) -> Any:
     """Return the params of a stage of a chain. Raises `UsageError` if the stage now has another version."""
     name = step["stage"]
     stage = registry.load(name)
-    if step["version"] not in (stage.version, *EARLIER_VERSIONS.get(name, ())):
+    if step["version"] != stage.version:
+        command = f"tacpipe {name.replace('.', ' ')}"
         raise UsageError(
-            f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
-            f"{stage.version}. Train it again."
+            f"The model was trained behind version {step['version']} of {name}; version {stage.version} returns other rows. "
+            f"Run `{command}` and the stages after it again, and then `tacpipe train` with the options that `tacpipe show` "
+            "prints for the model."
         )
     return params.from_json(stage, step["params"])
 

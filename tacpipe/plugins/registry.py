@@ -38,7 +38,8 @@ TRACKERS = "tacpipe.trackers"
 MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
 CODECS = "tacpipe.codecs"  # kind of codec: its class (`tacpipe.codecs.codec.Codec`)
 ENCODERS = "tacpipe.encoders"  # name: a function from a file of weights to a function from images to features
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS, ENCODERS)
+CHECKS = "tacpipe.checks"  # name: a subclass of `tacpipe.checks.check.Check`
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS, ENCODERS, CHECKS)
 PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # prefixes of stage names in other groups
 FIT, PART = ".fit", ".part"  # suffixes of the parts of a stage that have keys of their own
 _used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
@@ -390,6 +391,19 @@ def load_encoder(name: str) -> Any:
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
     return _load_plugin(ENCODERS, "encoder", name)
+
+
+def checks() -> list[str]:
+    """Return the names of all checks of recordings."""
+    return sorted(entry_points()[CHECKS])
+
+
+def load_check(name: str) -> Any:
+    """Return the class of a check, a subclass of `tacpipe.checks.check.Check`.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    return _load_plugin(CHECKS, "check", name)
 
 
 def _load_plugin(group: str, noun: str, name: Any) -> Any:

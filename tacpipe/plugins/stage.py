@@ -9,6 +9,7 @@ of each further parameter determines what the stage reads:
                    empty if it is annotated ``Dataset | None``; ``originals`` are the recordings as they were given,
                    before the stages in ``first``
 ``Datasets``       several datasets, as a tuple
+``Rows``           the rows that were read for each of the ``Datasets`` and those that it comes from, by stage
 ``Model``          a trained model: a `Dataset` whose ``files`` contain weights and configuration; ``init`` is optional
 ``Fitted``         the files that the stage's ``fit`` computed from the training recordings
 ``Parts``          the results of the stage's ``part`` for each recording, as a `Dataset`
@@ -39,6 +40,7 @@ from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, 
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
+from tacpipe.plugins.rows import StreamRows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -71,7 +73,7 @@ P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
 ALL = ("*",)  # value of ``reads`` for all attributes
 _KINDS = (
-    *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
+    *("Recording", "Dataset", "Datasets", "Rows", "Model", "Fitted", "Parts", "RecordingName"),
     *("Files", "Values", "Shared", "Trial", "Roles", "Workspace"),
 )
 
@@ -85,11 +87,16 @@ class RecordingOutput:
 
     A note is a sentence about a result that is valid but probably not intended. Commands print it as a warning, also on
     a cache hit. It is stored in the record and is not part of a key or digest.
+
+    ``rows`` account for every row that the stage read, by stream. Counts and notes are read after the batches, which may
+    add to them. A reader of files gives ``{}``, and `tacpipe.plugins.rows.drop_rows` states what it dropped. With None, a
+    stream that has as many rows in the result is used, and others are not counted.
     """
 
     tables: pa.Table | pa.RecordBatchReader | Mapping[str, pa.Table | pa.RecordBatchReader]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    rows: StreamRows | None = None
 
     @property
     def streams(self) -> dict[str, pa.Table | pa.RecordBatchReader]:
@@ -113,7 +120,7 @@ First = Callable[[Any], Mapping[str, Values]]  # params -> params of preceding s
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a stage over whole datasets: recordings, files or both, and notes for the user (as in `RecordingOutput`).
+    """Result of a stage over whole datasets: recordings, files or both, notes and rows (as in `RecordingOutput`).
 
     Files are read one at a time, so a mapping that creates each file on access keeps only one in memory. ``written``
     contains files that do not fit in memory, as functions that write the file to their argument; each is called once.
@@ -123,6 +130,7 @@ class Result:
     files: Mapping[str, bytes] = field(default_factory=dict)
     notes: Sequence[str] = ()
     written: Mapping[str, Callable[[Any], object]] = field(default_factory=dict)
+    rows: StreamRows | None = None
 
 
 @dataclass(frozen=True)

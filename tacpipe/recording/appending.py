@@ -20,11 +20,14 @@ from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.pages import Item
 from tacpipe.engine import keys, provenance
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.io.hashing import digest
+from tacpipe.plugins.rows import StageRows, stage_rows_from_json
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed, events_table
 from tacpipe.recording.spool import Spooled
+from tacpipe.store import records
 from tacpipe.store.records import Provenance, RecordingEntry, Shard, StoredResult
 from tacpipe.store.store import Object, Store
 
@@ -60,12 +63,16 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             files[BYTES] = store.put_written(copy_spool, durable=True).to_json()
     stored_result: StoredResult = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": stored_rig["digest"]}, {"spool": spooled.folder.name})
+    path, rig_name = output.absolute(), f"rig-{stored_rig['digest'][:8]}.toml"
+    rows, total = StageRows(1, {name: stream.counts for name, stream in sealed.items()}), _total_rows(store, path)
+    total.add(rows)
     provenance_entry: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - start_s, 4)),
         "irreplaceable": True,
+        "rows": rows.to_json(),
+        "stage_rows": {ACQUIRE: total.to_json()},
     }
     store.commit(identity, stored_result, provenance_entry, durable=True)
-    path, rig_name = output.absolute(), f"rig-{stored_rig['digest'][:8]}.toml"
     names: list[str] = []  # names under which the recording was added; a retry appends another
 
     def add_recording() -> directory.DirectoryChange:
@@ -87,10 +94,17 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
                 f"Recording {plain(name)} cannot be added to {path}: {plain(str(error), 200)}."
             ) from error
         names.append(name)
-        return directory.DirectoryChange(updated, may_lack=_other_paths(updated, name, rig_name))
+        may_lack = _other_paths(updated, name, rig_name)
+        return directory.DirectoryChange(updated, may_lack=may_lack, key=digest(identity))
 
     directory.change(store, path, add_recording)
     return names[-1]
+
+
+def _total_rows(store: Store, path: Path) -> StageRows:
+    """Return the rows of all recordings of the dataset at ``path``, from the record of the last one."""
+    record = store.record(key) if (key := directory.stored_key(store, path)) else None
+    return stage_rows_from_json(records.summary(record).get("stage_rows") if record else None).get(ACQUIRE, StageRows())
 
 
 def _other_paths(manifest: Manifest, name: str, rig: str) -> set[str]:
@@ -214,7 +228,11 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
     if (duration_s := spooled.header.get("duration_s")) is not None:
         attributes["requested_duration_s"] = float(duration_s)
     for name, stream in sealed.items():
-        attributes[f"{name}_lost"] = stream.lost
+        attributes[f"{name}_lost"] = stream.losses.certain
+        if stream.losses.by_clock:
+            attributes[f"{name}_lost_by_clock"] = stream.losses.by_clock
+        if stream.losses.estimated:
+            attributes[f"{name}_lost_estimated"] = stream.losses.estimated
         if not stream.rows:
             attributes[f"{name}_missing"] = True
         if stream.undecoded:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import Int64s, Times
-from tacpipe.recording.reading import StreamFault
+from tacpipe.recording.losses import StreamFault
 from tacpipe.recording.spool import StreamNote
 
 # Notes: this program was delayed; arrival times are reliable again

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Int64s, Times
+from tacpipe.recording.losses import CLOCK, ESTIMATED, SILENT, ClockGap, ClockGaps, StreamFault, StreamLosses
 from tacpipe.sensors.framing import Account, Chunks, FrameRun, FramingLoss
 from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.signals.sampling import SILENCE_NS, SILENCE_PERIODS, SamplingClock
 
 MAX_RATE_HZ = 100_000.0  # maximum rate of a device without a declared rate: no program sends records faster
 RESET_FACTOR = 3.0  # a gap of more than this multiple of the expected samples is a restart of the device
@@ -166,19 +167,8 @@ def _max_samples(elapsed_ns: int) -> float:
 LINK = "link"  # frames that the counter shows as missing and of which no byte arrived
 DEVICE = "device"  # samples that the device itself skipped
 DUPLICATE, LATE, RESET = "duplicate", "late", "counter_reset"
-SILENT = "silent"  # a device without counter sent nothing for too long, and no burst followed
-# the limit of a silence is the longer of these: periods of the stream, and ns
-SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000
-
-
-class StreamFault(NamedTuple):
-    """A fault of a stream, with its time, its cause, and the frames and bytes that it cost."""
-
-    t_ns: int
-    cause: str
-    frames: int = 0  # lost frames; negative for a frame that was counted as lost and arrived late
-    bytes: int = 0  # discarded bytes
-    detail: str = ""
+EXPLAINS_NS = 30_000_000_000  # a damaged frame explains a loss that is estimated within this time
+NOTE_NS = 100_000_000  # a note on dropped packets may be this much later than the next packet
 
 
 @dataclass(frozen=True)
@@ -207,7 +197,7 @@ class LinkReader:
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
         self.frames = 0  # number of frames with samples
-        self.lost = 0  # number of lost frames, by the counter if the device has one
+        self.losses = StreamLosses()
         self._framer = sensor.framer()
         self._previous_account = Account()  # account of the previous links
         self._unroller = _make_unroller(sensor, sensor.counter)
@@ -215,7 +205,15 @@ class LinkReader:
         self._pending_losses: list[FramingLoss] = []  # losses whose frames the counter of a later sample will show
         self._last_ns: int | None = None
         self._device_ns: tuple[int, int] | None = None  # the device's last clock reading, as sent and unrolled
-        self._silence: StreamFault | None = None  # the last silence; a burst after it reduces the loss
+        self._sampling, self._gaps = self._make_estimators()
+        self._outage_ns: int | None = None  # arrival of the last sample before the link was lost
+        self._explaining: list[tuple[int, int]] = []  # times and numbers of lost frames that no gap has explained yet
+        self._estimated = 0  # estimated losses that samples may take back
+
+    @property
+    def lost(self) -> int:
+        """The number of lost frames, without estimated ones."""
+        return self.losses.certain
 
     @property
     def account(self) -> Account:
@@ -234,7 +232,10 @@ class LinkReader:
     def end_link(self) -> Batch:
         """Return the last samples of a lost link. The next bytes are read from a new link."""
         batch = self._batch(*self._framer.flush())
+        batch = self._add_events(batch, self._gap_events(self._gaps.finish()))
         self._device_ns = None  # a device that lost power restarts its clock
+        self._sampling, self._gaps = self._make_estimators()
+        self._outage_ns = self._last_ns
         for unroller in (self._unroller, self._device_unroller):
             if unroller is not None:
                 unroller.note_reopened()
@@ -246,10 +247,22 @@ class LinkReader:
         """Return the last samples and events of the stream; the losses that no counter resolved count in full."""
         batch = self._batch(*self._framer.flush())
         final_events = tuple(_event(loss, loss.frames) for loss in self._pending_losses)
-        final_events += () if self._silence is None else (self._silence,)
-        self.lost += sum(event.frames for event in final_events)
-        self._pending_losses, self._silence = [], None
-        return replace(batch, events=batch.events + final_events)
+        self._pending_losses = []
+        return self._add_events(batch, [*final_events, *self._gap_events(self._gaps.finish())])
+
+    def note_dropped(self, fault: StreamFault) -> None:
+        """Note frames that are known to be lost, so that they are not counted again by a clock or an estimate."""
+        if fault.frames and self._unroller is None:
+            self._explaining.append((fault.t_ns, fault.frames))
+
+    def _make_estimators(self) -> tuple[SamplingClock, ClockGaps]:
+        period_ns = 1e9 / self.sensor.rate_hz if self.sensor.rate_hz else None
+        return SamplingClock(period_ns), ClockGaps()
+
+    def _add_events(self, batch: Batch, events: Sequence[StreamFault]) -> Batch:
+        """Return the batch with further events, which are added to the losses."""
+        self.losses += StreamLosses.from_events(events)
+        return replace(batch, events=(*batch.events, *events)) if events else batch
 
     def _batch(self, runs: Sequence[FrameRun], losses: Sequence[FramingLoss]) -> Batch:
         """Return the samples of new frames, without duplicates, and the faults of the frames and of framing losses."""
@@ -281,15 +294,56 @@ class LinkReader:
         else:
             events += [_event(loss, loss.frames) for loss in self._pending_losses]
             self._pending_losses = []
-            events += self._silences(t_ns)
-        self.lost += sum(event.frames for event in events)
+            for event in events:
+                self.note_dropped(event)
+            if self.sensor.awaited and not self.sensor.lossless and len(t_ns):
+                events += self._uncounted_losses(t_ns, t_device_ns)
         if len(t_ns):
             self._last_ns = int(t_ns[-1])
         blocks = tuple(
             np.concatenate(parts) for parts in zip(*(samples.values for samples in decoded_samples), strict=True)
         )
-        batch = Batch(t_ns, blocks, seq, device_seq, t_device_ns, tuple(sorted(events)))
+        batch = self._add_events(Batch(t_ns, blocks, seq, device_seq, t_device_ns), sorted(events))
         return batch if retained.all() else _select_rows(batch, retained)
+
+    def _uncounted_losses(self, t_ns: Times, t_device_ns: Times | None) -> list[StreamFault]:
+        """Return the losses of a device without a counter: those that its clock shows, and those that arrivals suggest."""
+        period_ns, events = 1e9 / self.sensor.rate_hz, []
+        if self._outage_ns is not None:
+            at_ns, since_ns, self._outage_ns = int(t_ns[0]), self._outage_ns, None
+            missing = self._unexplained(round((at_ns - since_ns) / period_ns) - 1, since_ns, at_ns)
+            events += [StreamFault(at_ns, ESTIMATED, missing, detail="while the link was lost")] if missing > 0 else []
+        elif self._last_ns is not None:
+            steps_ns = np.diff(t_ns, prepend=self._last_ns)
+            for row in np.flatnonzero(steps_ns > SILENCE_NS + SILENCE_PERIODS * period_ns).tolist():
+                detail = f"{steps_ns[row] / 1e9:.1f} s; it is unknown whether samples were lost"
+                events.append(StreamFault(int(t_ns[row]), SILENT, detail=detail))
+        if t_device_ns is not None:
+            events += self._gap_events(self._gaps.feed(t_device_ns, t_ns))
+        for row, count in self._sampling.place(t_ns, None, t_device_ns).losses:
+            at_ns = int(t_ns[row])
+            missing = (
+                self._unexplained(count, at_ns - EXPLAINS_NS, at_ns) if count > 0 else max(count, -self._estimated)
+            )
+            self._estimated += missing
+            events += [StreamFault(at_ns, ESTIMATED, missing, detail="by the arrivals")] if missing else []
+        return events
+
+    def _gap_events(self, gaps: Sequence[ClockGap]) -> list[StreamFault]:
+        """Return the losses that gaps in the device's clock show, without those that damaged bytes have shown."""
+        counts = [(gap, self._unexplained(gap.skipped, gap.before_ns, gap.after_ns + NOTE_NS)) for gap in gaps]
+        return [StreamFault(gap.after_ns, CLOCK, count) for gap, count in counts if count]
+
+    def _unexplained(self, missing: int, since_ns: int, until_ns: int) -> int:
+        """Return how many of the missing frames are not among those known to be lost between two times."""
+        self._explaining = [
+            (t_ns, count) for t_ns, count in self._explaining if count and t_ns > until_ns - 2 * EXPLAINS_NS
+        ]
+        for number, (t_ns, count) in enumerate(self._explaining):
+            if since_ns < t_ns <= until_ns:
+                explained = min(count, missing)
+                self._explaining[number], missing = (t_ns, count - explained), missing - explained
+        return missing
 
     def _unroll_device_time(self, sent_ns: Times, wrap_ns: int) -> Times:
         """Return device times (sample,) in ns without wrap-arounds. Smaller steps back are retained."""
@@ -327,27 +381,6 @@ class LinkReader:
             last_ns = int(t_ns[-1])
             events += [_event(loss, 0) for loss in self._pending_losses if loss.t_ns <= last_ns]
             self._pending_losses = [loss for loss in self._pending_losses if loss.t_ns > last_ns]
-        return events
-
-    def _silences(self, t_ns: Times) -> list[StreamFault]:
-        """Return the silences that ended. Samples in a burst after a silence were late, not lost."""
-        if not self.sensor.awaited or not len(t_ns):
-            return []
-        period_ns = 1e9 / self.sensor.rate_hz
-        steps_ns = np.diff(t_ns, prepend=int(t_ns[0]) if self._last_ns is None else self._last_ns)
-        silent = steps_ns > max(SILENT_NS, SILENT_PERIODS * period_ns)
-        if self._silence is None and not silent.any():
-            return []
-        events = []
-        for at_ns, step_ns, is_silent in zip(t_ns.tolist(), steps_ns.tolist(), silent.tolist(), strict=True):
-            if self._silence is not None and (is_silent or step_ns > period_ns / 2):
-                events.append(self._silence)
-                self._silence = None
-            elif self._silence is not None:
-                self._silence = self._silence._replace(frames=max(0, self._silence.frames - 1))
-            if is_silent:
-                lost = max(0, round(step_ns / period_ns) - 1)
-                self._silence = StreamFault(at_ns, SILENT, lost, detail=f"{step_ns / 1e6:.0f} ms, by the clock")
         return events
 
 

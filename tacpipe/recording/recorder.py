@@ -30,7 +30,8 @@ TICK_S = 0.05  # period of moving bytes to the spool; a crash loses about this m
 SYNC_S = 0.5  # period of syncing the spool
 FIRST_S = 3.0  # timeout for the first sample of a stream that sends continuously
 SILENT_S = 2.0  # a stream that sends continuously counts as lost after this time without a sample
-DRAIN_S = 2.0  # timeout for emptying the links after a delay of this program
+DRAIN_S = 2.0  # timeout for emptying the links at the end of a recording
+DRAIN_PAUSE_S = 0.005  # pause between two looks whether they are empty
 PREROLL_S = 0.5  # recorded time before a trigger
 
 
@@ -168,8 +169,7 @@ class Recorder:
             if self._companion is not None:
                 self._companion.end()
             self._note_tick()
-            if clock.now_ns() - self._punctual_since_ns < DRAIN_S * 1e9:
-                self._drain()
+            self._drain()
             last_blocks = {name: station.end_recording() for name, station in self.stations.items()}
             for name, blocks in last_blocks.items():
                 _spool_blocks(spool, name, blocks)
@@ -208,7 +208,7 @@ class Recorder:
         """Wait for at most `DRAIN_S` until all links have been read empty."""
         start_ns = clock.now_ns()
         while clock.now_ns() - start_ns < DRAIN_S * 1e9:
-            clock.sleep(TICK_S)
+            clock.sleep(DRAIN_PAUSE_S)
             if all(station.is_drained(start_ns) for station in self.stations.values()):
                 return
 

@@ -124,6 +124,7 @@ def _parse_stream(table: Values, source: str) -> RigStream:
             f"{source}: {kind} cannot be reached by {plain(str(address))}; it must be {' or '.join(sensor.links)}, as in "
             f"{' or '.join(link.SCHEMES[scheme] for scheme in sensor.links)}."
         )
+    object.__setattr__(sensor, "datagrams", address.scheme in link.DATAGRAM_SCHEMES)
     return RigStream(name, kind, sensor, address, options, emulate)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +12,11 @@ from tacpipe.arrays import Int64s, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.io.spill import Piece, Spill
+from tacpipe.plugins import rows
+from tacpipe.plugins.rows import RowCounts
+from tacpipe.recording.losses import SILENT, StreamFault, StreamLosses
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
-from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, LinkReader, StreamFault
+from tacpipe.recording.reading import DUPLICATE, Batch, LinkReader
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Spooled, StreamNote
 from tacpipe.recording.spool_folders import COMPLETED
@@ -36,10 +39,10 @@ class Stamping:
 class Decoded:
     """Samples of one stream in order of arrival."""
 
-    def __init__(self, fields: Sequence[pa.Field], spill: Spill) -> None:
+    def __init__(self, sensor: Sensor, spill: Spill) -> None:
         self.count = 0
         self.first_ns = self.last_ns = 0  # first and last arrival on the monotonic clock, if there are samples
-        self._fields, self._spill = fields, spill
+        self._time, self._fields, self._spill = sensor.time_field(), sensor.fields(), spill
         self._device: list[pa.Field] = []  # fields of the device's clock and counters
         self._in_memory: list[pa.Table] = []
         self._bytes = 0  # size of the tables in memory
@@ -76,7 +79,7 @@ class Decoded:
 
     def batches(self, stamping: Stamping, *, uncertain: bool) -> pa.RecordBatchReader:
         """Return the samples with UTC timestamps in batches. If ``uncertain``, a column has their possible delays."""
-        stamps = [schema.time_field()]
+        stamps = [self._time]
         if uncertain:
             stamps.append(pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"}))
         full_schema = pa.schema([*stamps, *self._device, *self._fields])
@@ -104,7 +107,7 @@ class Decoded:
             yield self._spill.read(piece)
 
 
-END_S = 0.5  # a stream that ends up to this time before the others gets no event
+END_S, END_PERIODS = 0.5, 5.0  # a stream that ends up to the longer of these before the others gets no event
 UNDECODED = "undecoded"  # bytes that the driver could not decode
 CRASH = "crash"  # bytes that a process had read but not written when it ended
 MEMORY_BYTES = 1 << 24  # size of decoded samples above which they move to disk
@@ -119,11 +122,22 @@ class Sealed:
     batches: Callable[[], pa.RecordBatchReader]  # returns the samples
     span_ns: tuple[int, int] | None  # timestamps of the first and the last sample; None without samples
     events: list[StreamFault]
-    lost: int  # number of lost frames, by the counter if the device has one
+    losses: StreamLosses
     received: int = 0  # number of bytes
     undecoded: int = 0  # number of bytes that the driver could not decode
     crashed: tuple[int, int] = (0, 0)  # numbers of chunks and bytes that were read but never spooled
     uncertain: int = 0  # number of samples whose timestamp may be late because this program was delayed
+
+    @property
+    def counts(self) -> RowCounts:
+        """The decoded samples, of which those received before are not stored."""
+        duplicates = sum(event.cause == DUPLICATE for event in self.events)
+        return RowCounts(self.rows + duplicates, self.rows, {rows.DUPLICATE: duplicates})
+
+    @property
+    def lost(self) -> int:
+        """The number of lost frames, without estimated ones."""
+        return self.losses.certain
 
     @property
     def table(self) -> pa.Table:
@@ -145,7 +159,7 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
     moved to ``spill``, or to a new one, which lives as long as the result.
     """
     sensor = rig.streams[name].sensor
-    decoded, stalls = Decoded(sensor.fields(), spill or Spill(MEMORY_BYTES)), Stalls()
+    decoded, stalls = Decoded(sensor, spill or Spill(MEMORY_BYTES)), Stalls()
     tally = _decode_blocks(_joined_blocks(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
     events = tally.events + _end_silence(sensor, last_ns, end_ns)
@@ -161,7 +175,7 @@ def seal_stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: S
         lambda: decoded.batches(stamping, uncertain=late > 0),
         (stamping.utc_ns(decoded.first_ns), stamping.utc_ns(decoded.last_ns)) if decoded.count else None,
         events,
-        sum(event.frames for event in events),
+        StreamLosses.from_events(events),
         received=tally.bytes,
         undecoded=tally.undecoded,
         crashed=crashed,
@@ -201,6 +215,7 @@ def _decode_blocks(blocks: Iterable[Chunks | StreamNote], sensor: Sensor, decode
                 tally.events += [] if stall is None else [stall]
             elif block.what != OPENED or was_lost:  # opening a link before the recording is not an event
                 tally.events.append(_note_event(block, sensor))
+                reader.note_dropped(tally.events[-1])
             continue
         tally.chunks += len(block.size)
         tally.bytes += len(block.data)
@@ -231,13 +246,10 @@ def _note_event(note: StreamNote, sensor: Sensor) -> StreamFault:
 def _end_silence(sensor: Sensor, last_ns: int, end_ns: int) -> list[StreamFault]:
     """Return the event of a stream that ended well before the recording, which no counter shows; else an empty list."""
     silent_s = (end_ns - last_ns) / 1e9
-    if not sensor.awaited or silent_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
+    if not sensor.awaited or silent_s < max(END_S, END_PERIODS / sensor.rate_hz):
         return []
-    return [
-        StreamFault(
-            end_ns, SILENT, round(silent_s * sensor.rate_hz), detail=f"{silent_s:.1f} s, up to the end, by the clock"
-        )
-    ]
+    missing = 0 if sensor.lossless else round(silent_s * sensor.rate_hz)
+    return [StreamFault(end_ns, SILENT, missing, detail=f"{silent_s:.1f} s, up to the end, by the clock")]
 
 
 def _joined_blocks(spooled: Spooled, name: str) -> Iterator[Chunks | StreamNote]:

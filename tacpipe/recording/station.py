@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import opening
-from tacpipe.links.link import Link, LinkLostError, OpenLink
+from tacpipe.links.link import DATAGRAM_SCHEMES, Link, LinkLostError, OpenLink
 from tacpipe.links.opening import NoReplyError
 from tacpipe.recording import clock
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, WAITED_NS, Pace
@@ -24,7 +24,6 @@ from tacpipe.sensors.sensor import Sensor
 if TYPE_CHECKING:
     from tacpipe.links.probing import SensorCandidate
 
-DATAGRAM_SCHEMES = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
 BEGAN, OVER = "began", "over"  # notes for listeners; the blocks between them belong to the recording
 FOREIGN = "foreign"  # cause of packets that other senders sent
@@ -233,7 +232,9 @@ class Station:
         elif pace.has_caught_up(start_ns, stop_ns):
             self._notes.append(StreamNote(at_ns, self.stream.name, CAUGHT_UP))
         self._add_packets(packets)
-        if not packets or stop_ns - start_ns > WAITED_NS:
+        if not packets:
+            self._empty_ns = start_ns + round(min(timeout_s * 1e9, stop_ns - start_ns))
+        elif stop_ns - start_ns > WAITED_NS:
             self._empty_ns = start_ns
         return packets
 

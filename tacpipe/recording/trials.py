@@ -10,15 +10,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tacpipe.datasets.manifest import ACQUIRE
 from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import termination
 from tacpipe.io.termination import EndRequest
+from tacpipe.plugins.rows import StageRows
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, sealing, spool_folders, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.appending import NothingError
+from tacpipe.recording.losses import StreamLosses
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import ENDED, Spool, Spooled, StreamNote
@@ -82,18 +85,21 @@ class Recorded:
     name: str
     seconds: float
     rows: dict[str, int]  # number of samples by stream
-    lost: dict[str, int]  # number of lost frames by stream
+    lost: dict[str, int]  # number of lost frames by stream, without estimated ones
+    losses: dict[str, StreamLosses]  # lost frames by stream, and by what shows them
     ended: str = COMPLETED  # completed, interrupted or recovered
     spool: str = ""  # path of its retained spool; empty if the spool was removed
+    unused: str = ""  # sentence on samples that were not stored
 
     def line(self) -> str:
         """Return the recording's name, duration, samples and losses as one line."""
         counts = ", ".join(
-            f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
+            f"{name} {rows} samples" + (f" ({self.losses[name]})" if self.losses[name] != StreamLosses() else "")
             for name, rows in self.rows.items()
         )
         retained = f"; its spool was moved to {self.spool}" if self.spool else ""
-        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {counts}{retained}"
+        unused = f"; {self.unused}" if self.unused else ""
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {counts}{retained}{unused}"
 
 
 def run(
@@ -207,8 +213,10 @@ def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     rows = {name: stream.rows for name, stream in sealed.items()}
     spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     seconds = (max(last for _, last in spans_ns) - min(first for first, _ in spans_ns)) / 1e9
-    lost = {name: stream.lost for name, stream in sealed.items()}
-    return Recorded(name, seconds, rows, lost, spooled.ended, retained)
+    losses = {name: stream.losses for name, stream in sealed.items()}
+    lost = {name: count.certain for name, count in losses.items()}
+    counts = StageRows(1, {name: stream.counts for name, stream in sealed.items()})
+    return Recorded(name, seconds, rows, lost, losses, spooled.ended, retained, counts.describe_unused(ACQUIRE))
 
 
 def _triggers(

@@ -34,7 +34,8 @@ class Figures:
     jitter_ms: float  # standard deviation of the time between arrivals
     latency_ms: float | None  # median delay relative to the fastest sample, by the device's clock; None without a clock
     samples: int  # total
-    lost: int  # total
+    lost: int  # total, without estimated losses
+    lost_estimated: int  # total
     bytes_lost: int  # total
 
 
@@ -80,8 +81,8 @@ class Watch:
         if device and len(device) == len(self._recent):
             late_ns = t_ns - np.concatenate(device)
             latency_ms = float(np.median(late_ns - late_ns.min()) / 1e6)
-        lost = self._reader.lost
-        return Figures(rate_hz, jitter_ms, latency_ms, self.samples, lost, self._reader.account.lost)
+        losses, bytes_lost = self._reader.losses, self._reader.account.lost
+        return Figures(rate_hz, jitter_ms, latency_ms, self.samples, losses.certain, losses.estimated, bytes_lost)
 
     def tare(self) -> None:
         """Measure the rest level again from the next samples."""
@@ -187,7 +188,8 @@ class RigView:
         for name, values in figures.items():
             latency = "" if values.latency_ms is None else f"{values.latency_ms:.2f}"
             row = (f"{values.rate_hz:.1f}", f"{values.jitter_ms:.2f}", latency, str(values.samples))
-            table.add_row(name, *row, str(values.lost), str(values.bytes_lost), style="red" if values.lost else None)
+            lost = str(values.lost) + f" + about {values.lost_estimated}" * (values.lost_estimated > 0)
+            table.add_row(name, *row, lost, str(values.bytes_lost), style="red" if values.lost else None)
         maps = [Text.assemble(name + "\n", *self._heat_map(name)) for name in figures if self._tactile[name]]
         return Group(table, *(Text(printable.shown(footer_line)) for footer_line in self._footer()), *maps)
 
@@ -213,9 +215,10 @@ class RigView:
 def describe_figures(name: str, figures: Figures) -> str:
     """Return the figures of a stream as one line.
 
-    >>> describe_figures("xela1", Figures(50.02, 0.41, None, 120, 1, 0))
+    >>> describe_figures("xela1", Figures(50.02, 0.41, None, 120, 1, 0, 0))
     'xela1 50.0 Hz, jitter 0.4 ms, 120 samples, 1 lost'
     """
     latency = "" if figures.latency_ms is None else f", latency {figures.latency_ms:.1f} ms"
     counts = f"{figures.samples} samples, {figures.lost} lost"
+    counts += f", about {figures.lost_estimated} more" * (figures.lost_estimated > 0)
     return f"{name} {figures.rate_hz:.1f} Hz, jitter {figures.jitter_ms:.1f} ms{latency}, {counts}"

@@ -13,12 +13,12 @@ import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
-from tacpipe.datasets.manifest import ManifestJson
 from tacpipe.datasets.selection import PUBLISHED, is_simulated
 from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.rows import TABLE_HEADS, table_of_rows
 from tacpipe.report import charts
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, fold, notes, table
 from tacpipe.report.charts import Curve, Spec
@@ -131,8 +131,9 @@ def is_published(result: Dataset, sets: Collection[str]) -> bool:
     return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
 
 
-def provenance_blocks(manifest: ManifestJson) -> list[Block]:
-    """Return the chain of stages that produced a dataset, from its manifest, with params and digests."""
+def provenance_blocks(result: Dataset) -> list[Block]:
+    """Return the chain of stages that produced a dataset, with params, digests, and the rows that were read."""
+    manifest = result.manifest
     last: Step = {
         "stage": manifest["stage"],
         "version": manifest["version"],
@@ -149,8 +150,12 @@ def provenance_blocks(manifest: ManifestJson) -> list[Block]:
     for argument, datasets in manifest["inputs"].items():
         dataset_digests += [(argument, dataset["dataset"]) for dataset in datasets]
     digests = [[name, digest] for name, digest in dataset_digests if digest]
+    counted = [row for dataset in result.chain_rows for row in table_of_rows(dataset["stages"])]
+    uncounted = sum(dataset["uncounted"] for dataset in result.chain_rows)
     return [
         table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows, words=True),
+        *([table("Rows that were read", TABLE_HEADS, counted, words=True)] if counted else []),
+        *([notes(f"The rows of {uncounted} results were not counted.")] if uncounted else []),
         table("Digests of datasets", ["", "digest"], digests, words=True),
     ]
 

@@ -58,7 +58,7 @@ def metric_folds(result: Dataset, number: int, count: int) -> list[Fold]:
     return [
         Fold(
             title,
-            [*headline_blocks, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)],
+            [*headline_blocks, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result)],
         )
     ]
 
@@ -332,13 +332,13 @@ def basis_folds(context: Context) -> list[Fold]:
 def source_folds(context: Context) -> list[Fold]:
     """Return a fold with the provenance of the best method's median run, or of the first result without comparisons."""
     if not context.comparisons:
-        return [Fold("Where it comes from", provenance_blocks(result.manifest)) for result in context.bare[:1]]
+        return [Fold("Where it comes from", provenance_blocks(result)) for result in context.bare[:1]]
     first = context.comparisons[0]
     method = context.winner(first.question.part) or context.methods[0]
     run = median_run(method, first)
     params = ", ".join(f"{name} = {json.dumps(value, default=str)}" for name, value in sorted(run.settings.items()))
     note = SmallPrint(f"A run of {method.name}{f', seed {run.seed}' if run.seed is not None else ''}, with {params}.")
-    return [Fold("Where it comes from", [note, *provenance_blocks(run.dataset.manifest)])]
+    return [Fold("Where it comes from", [note, *provenance_blocks(run.dataset)])]
 
 
 def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:

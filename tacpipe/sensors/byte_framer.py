@@ -3,8 +3,9 @@
 Undisturbed bytes are processed as one array (frame, byte), without a Python loop over bytes.
 
 A frame is returned as soon as it is verified. With only marks (`Framing.check` is None) or an 8-bit checksum, ``confirm``
-good frames must follow it, because the last frame before a disturbance may be damaged. After a disturbance, the framer locks
-again on ``lock`` good frames in a row, which are all returned.
+good frames must follow it, because the last frame before a disturbance may be damaged. The end of a datagram, or of the
+stream, confirms a frame that ends there. After a disturbance, the framer locks again on ``lock`` good frames in a row, which
+are all returned.
 
 A text frame is recognised by its content. A sensor that can check many texts faster at once provides ``check_all``, which
 returns whether all of them are frames; texts that are not are then located by bisection.
@@ -19,6 +20,7 @@ import numpy as np
 from tacpipe.arrays import Bools, Bytes
 from tacpipe.sensors.framing import (
     CUT,
+    END,
     GARBLED,
     MALFORMED,
     NOISE,
@@ -40,8 +42,9 @@ Span = tuple[int, int, int]  # consecutive frames of one size: start, size, coun
 class ByteFramer:
     """Split a stream of bytes into the frames that a `Framing` describes."""
 
-    def __init__(self, framing: Framing) -> None:
-        self.framing = framing
+    def __init__(self, framing: Framing, *, datagrams: bool = False) -> None:
+        """Split bytes into the frames of ``framing``; with ``datagrams``, each chunk is one datagram."""
+        self.framing, self._datagrams = framing, datagrams
         self.account = Account()
         self._text = ByteBuffer()
         self._locked = False
@@ -62,22 +65,18 @@ class ByteFramer:
         return self._scan(at_end=False)
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
-        """Return the last frames and losses at the end of the stream. Frames without a checksum need a confirmation."""
+        """Return the last frames and losses at the end of the stream. An incomplete last frame is no lost frame."""
         runs, losses = self._scan(at_end=True)
         remaining = len(self._text.data)
         if remaining:
-            cause = CUT if self._has_frames else START
-            if self._locked and self._last_size and remaining >= self._last_size:  # a complete frame is buffered
-                cause = UNCONFIRMED
-            losses.append(self._lose(0, remaining, cause))
+            losses.append(self._lose(0, remaining, START if not self._has_frames else END if self._locked else CUT))
             self._text.cut(remaining)
         return runs, losses
 
     def _scan(self, *, at_end: bool) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the frames and losses in the buffered bytes, and remove these bytes.
 
-        Frames that following bytes must confirm stay in the buffer, unless the stream is ``at_end`` and they have a
-        checksum.
+        Frames that following bytes must confirm stay in the buffer, unless the stream is ``at_end``.
         """
         runs: list[FrameRun] = []
         losses: list[FramingLoss] = []
@@ -94,7 +93,9 @@ class ByteFramer:
                 self._dead_starts.clear()
                 self._broken_at = None
             spans, stop, broken = self._chain(offset)
-            unconfirmed = 0 if at_end and not broken and self.framing.has_checksum else self.framing.confirm
+            unconfirmed = 0 if at_end and not broken else self.framing.confirm
+            if unconfirmed and self._datagrams and spans and self._text.ends_chunk(stop - spans[-1][1], stop):
+                unconfirmed = 0
             offset = self._add_runs(spans, unconfirmed, runs, offset)
             if not broken:
                 break
@@ -308,6 +309,7 @@ class ByteFramer:
         self.account.lost += stop - start
         frame_size = self._last_size or stop - start
         frames = 0 if cause in (START, NOISE) else max(1, round((stop - start) / frame_size))
+        frames = (stop - start) // frame_size if cause == END else frames
         return FramingLoss(self._text.arrival(stop - 1), cause, frames, stop - start)
 
 
@@ -365,7 +367,7 @@ class LineFramer:
         text = self._text.data
         stop = text.rfind(b"\n") + 1
         if not stop:
-            return [], (self._drop(len(text)) if len(text) > self.max_size else [])
+            return [], (self._drop(len(text), CUT) if len(text) > self.max_size else [])
         lines = text[: stop - 1].split(b"\n")
         sizes = np.fromiter(map(len, lines), np.int64, len(lines)) + 1
         arrival = self._text.arrivals(sizes.cumsum() - 1)
@@ -387,16 +389,16 @@ class LineFramer:
 
     def flush(self) -> tuple[list[FrameRun], list[FramingLoss]]:
         """Return the incomplete last line as a loss."""
-        return [], self._drop(len(self._text.data))
+        return [], self._drop(len(self._text.data), END)
 
-    def _drop(self, count: int) -> list[FramingLoss]:
+    def _drop(self, count: int, cause: str) -> list[FramingLoss]:
         """Remove ``count`` bytes without a line end, and return them as a loss."""
         if not count:
             return []
         last_ns = self._text.arrival(count - 1)
         self.account.lost += count
         self._text.cut(count)
-        return [FramingLoss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
+        return [FramingLoss(last_ns, cause if self._has_lines else START, int(self._has_lines and cause == CUT), count)]
 
 
 def _check_texts(texts: Sequence[bytes], check: Check, check_all: CheckAll | None) -> Bools:

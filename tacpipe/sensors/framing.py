@@ -18,8 +18,9 @@ from tacpipe.arrays import Bools, Bytes, Int64s, Ints, Times
 START = "start"  # bytes before the first frame, because recording started in the middle of a frame
 NOISE = "noise"  # bytes between complete frames
 CUT = "cut"  # an incomplete frame
+END = "end"  # bytes after the last frame, because the link or the recording ended in the middle of a frame
 GARBLED = "garbled"  # as many bytes as in complete frames, but with wrong checksum or marks
-UNCONFIRMED = "unconfirmed"  # a frame with only marks, right before a disturbance or at the end
+UNCONFIRMED = "unconfirmed"  # a frame without a strong checksum, right before a disturbance
 MALFORMED = "malformed"  # a packet that does not follow the protocol
 
 
@@ -149,6 +150,11 @@ class ByteBuffer:
     def arrival(self, offset: int) -> int:
         """Return the arrival of the byte at ``offset`` in ns."""
         return self._stamps[bisect_right(self._ends, self.base + offset)]
+
+    def ends_chunk(self, start: int, stop: int) -> bool:
+        """Return whether a chunk contains all bytes from ``start`` to ``stop``, and ends at ``stop``."""
+        chunk = bisect_right(self._ends, self.base + start)
+        return chunk < len(self._ends) and self._ends[chunk] == self.base + stop
 
     def arrivals(self, offsets: Times | range) -> Times:
         """Return the arrivals (byte,) in ns of the bytes at ``offsets`` (byte,), which must be ascending and not empty.

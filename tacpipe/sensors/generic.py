@@ -150,14 +150,15 @@ class Generic(layout.DescribedSensor):
             return PacketFramer([self.size], self._has_marks)
         marker, tail = _bytes("marker", self.marker), _bytes("tail", self.tail)
         weak = self.sum is None
-        confirm = int(layout.SUMS[self.sum.kind][1] == 1) if self.sum else int(bool(marker))
+        is_strong = self.sum is not None and layout.SUMS[self.sum.kind][1] > 1
+        confirm = int(not is_strong and not (tail and self.length is None))
         framing = Framing(
             marker, tail, check=check, lock=3 if weak else 2, confirm=confirm, max_size=MAX_SIZE, weak=weak
         )
         if self.length is None:
-            return ByteFramer(replace(framing, size=self.size))
+            return ByteFramer(replace(framing, size=self.size), datagrams=self.datagrams)
         header = max(self._spans[self.length.number].stop, len(marker) + 1)
-        return ByteFramer(replace(framing, header=header, sizes=self._sizes))
+        return ByteFramer(replace(framing, header=header, sizes=self._sizes), datagrams=self.datagrams)
 
     def _sizes(self, heads: Bytes) -> Int64s:
         assert self.length is not None

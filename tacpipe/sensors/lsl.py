@@ -40,6 +40,7 @@ class Lsl(Sensor):
     summary: ClassVar[str] = "A Lab Streaming Layer (LSL) stream of numbers or markers."
     links: ClassVar[tuple[str, ...]] = ("lsl",)
     described: ClassVar[bool] = True
+    lossless: ClassVar[bool] = True
     guesses: ClassVar[Mapping[str, str]] = {
         "channels": "from the outlet; omit them to use those that it declares when a recording starts",
     }

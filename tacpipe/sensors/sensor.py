@@ -117,6 +117,10 @@ class Sensor:
     # time after which the device's clock wraps to 0; None: it does not wrap
     device_wrap_ns: ClassVar[int | None] = None
     listens: ClassVar[bool] = False  # True if the device sends by UDP to an address that is configured in the device
+    # True if each chunk of the link is one datagram; the address in the rig file decides
+    datagrams: ClassVar[bool] = False
+    # True if the link repeats what is lost, so that a gap is a pause of the sender
+    lossless: ClassVar[bool] = False
     steady: ClassVar[bool] = True  # True if it sends at its rate all the time; False: only on events
     exclusive: ClassVar[str] = ""  # sentence on programs that cannot use the device at the same time; empty: no limit
     usb_ids: ClassVar[tuple[str, ...]] = ()  # USB ids (vendor:product) of the product, such as "16d0:14cc"
@@ -133,6 +137,12 @@ class Sensor:
     def awaited(self) -> bool:
         """True if samples arrive continuously, so that silence is a fault."""
         return self.steady and self.rate_hz > 0
+
+    def time_field(self) -> pa.Field:
+        """Return the field of the arrivals of the samples, with the declared period if samples arrive continuously."""
+        from tacpipe.channels import schema
+
+        return schema.time_field(arrivals=True, period_ns=round(1e9 / self.rate_hz) if self.awaited else None)
 
     def fields(self) -> list[pa.Field]:
         """Return the Arrow field of each channel: name, native type, unit, quantity and layout."""

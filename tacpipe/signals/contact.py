@@ -61,8 +61,8 @@ def lowest_rows(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:
     return rows
 
 
-def measure_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
-    """Return the rest level of each channel (channel,) and the mask of its rows (time,), None for those at the start.
+def measure_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple[Floats, Bools]:
+    """Return the rest level of each channel (channel,), and the mask of its rows (time,).
 
     ``rest_rows`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for `lowest_rows`. Raises `TacpipeError`
     without rows.
@@ -77,7 +77,7 @@ def measure_rest(rest_rows: str, blocks: Blocks, t_ns: Times, rest_s: float) -> 
             if t_ns[count - 1] > t_ns[0] + round(rest_s * 1e9):
                 break
         values = np.concatenate(first_rows)
-        return rest_level(values, t_ns[: len(values)], rest_s), None
+        return rest_level(values, t_ns[: len(values)], rest_s), t_ns <= t_ns[0] + round(rest_s * 1e9)
     totals = [np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf) for values in blocks()]
     rows = lowest_rows(np.concatenate(totals), t_ns, rest_s)
     rest_values, first = [], 0
@@ -147,13 +147,11 @@ def load_in_blocks(blocks: Blocks, rest_level: Floats, axes: int) -> tuple[Float
     return np.concatenate(loads), np.concatenate(repeated)
 
 
-def noise_thresholds(
-    repeated: Bools, load: Floats, t_ns: Times, rest_s: float, rest: Bools | None = None
-) -> Thresholds:
+def noise_thresholds(repeated: Bools, load: Floats, rest: Bools) -> Thresholds:
     """Return thresholds from the noise of a sensor at rest, in any unit.
 
-    The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds or the rows ``rest`` (time,),
-    without rows that repeat the previous one (``repeated``). The start threshold is 40 times the noise, but at most 25 %
+    The noise is the upper quartile of ``load`` (time,) over the rows ``rest`` (time,), without
+    rows that repeat the previous one (``repeated``). The start threshold is 40 times the noise, but at most 25 %
     and at least 5 % of the largest load, and at least 10 times the noise. The end threshold is two thirds of it. On 52
     published trials of a XELA uSkin, the start threshold is 70 to 230 counts; the authors chose 120. Without load, the
     thresholds are infinite.
@@ -162,7 +160,7 @@ def noise_thresholds(
     largest = float(np.quantile(load[finite], PEAK_QUANTILE)) if finite.any() else 0.0
     if largest <= 0:
         return Thresholds(np.inf, np.inf)
-    at_rest = finite & ~repeated & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)
+    at_rest = finite & ~repeated & rest
     noise = float(np.quantile(load[at_rest], 0.75)) if at_rest.any() else 0.0
     usual = min(NOISE_USUAL * noise, PEAK_MAX * largest)
     on = max(NOISE_MIN * noise, PEAK_MIN * largest, usual)

@@ -133,6 +133,18 @@ def newest_rows(t_ns: Times, grid_ns: Times) -> Indices:
     return np.searchsorted(t_ns, grid_ns, side="right") - 1
 
 
+def newest_known_rows(arrival_ns: Times, t_ns: Times, row_arrival_ns: Times, row_ns: Times) -> Indices:
+    """Return the newest sample that had arrived by each row's arrival and was measured by its time (row,), or -1.
+
+    Arrivals ``arrival_ns`` and times ``t_ns`` of the samples, both (time,), must not decrease.
+
+    >>> arrival_ns, t_ns = np.array([20, 20, 40]), np.array([10, 20, 30])
+    >>> newest_known_rows(arrival_ns, t_ns, np.array([20, 39, 40]), np.array([15, 39, 40])).tolist()
+    [0, 1, 2]
+    """
+    return np.minimum(newest_rows(arrival_ns, row_arrival_ns), newest_rows(t_ns, row_ns))
+
+
 def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     """Return a mask of grid points (grid,) at which the newest sample, of ``newest_ns``, is older than ``gap_ns``.
 
@@ -141,13 +153,12 @@ def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     return grid_ns - newest_ns > gap_ns
 
 
-def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -> Floats:
+def median_before(t_ns: Times, values: AnyArray, newest: Indices, grid_ns: Times, span_ns: int) -> Floats:
     """Return the median of the samples in the ``span_ns`` up to each grid point, float64 (grid, channel).
 
-    ``values`` are (time, channel). Without a sample in the window, the result is the newest sample. Each grid point needs
-    a sample at or before it.
+    ``values`` are (time, channel), and ``newest`` (grid,) the row of the newest sample of each grid point. Without a sample
+    in the window, the result is the newest sample.
     """
-    newest = newest_rows(t_ns, grid_ns)
     medians: Floats = values[newest].astype(np.float64)
     first = np.searchsorted(t_ns, grid_ns - span_ns, side="left")
     for point in np.flatnonzero(newest > first):

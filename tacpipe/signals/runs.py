@@ -62,6 +62,18 @@ def run_starts(t_ns: Times, gap: float = GAP) -> Bools:
     return begins
 
 
+def rows_in_windows(starts: Indices, length: int, rows: int) -> Bools:
+    """Return a mask (time,) of the rows in any window of ``length`` rows from one of ``starts`` (window,).
+
+    >>> rows_in_windows(np.array([1, 2]), 2, 5).tolist()
+    [False, True, True, True, False]
+    """
+    changes = np.zeros(rows + 1, dtype=np.int64)
+    np.add.at(changes, starts, 1)
+    np.add.at(changes, starts + length, -1)
+    return np.asarray(np.cumsum(changes)[:-1] > 0)
+
+
 def window_starts(groups: AnyArray, usable: Bools, context: int, horizon: int, stride: int = 1) -> Int64s:
     """Return the first rows (window,) of all windows of ``context + horizon`` rows.
 

@@ -14,6 +14,7 @@ from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 
 if TYPE_CHECKING:
+    from tacpipe.io import Json
     from tacpipe.plugins.stage import Attribute, StoredParams, Values
     from tacpipe.store.store import Store
 
@@ -82,6 +83,9 @@ class RunIdentity(TypedDict):
     sources: Mapping[str, Mapping[str, str]]  # digests of raw files by recording
     fold: int
     role: str | None
+    equal: NotRequired[
+        Sequence[Sequence[str]]
+    ]  # groups of recordings with equal content that keep a split from separating them
 
 
 @final
@@ -125,14 +129,18 @@ class Provenance(Environment, total=False):
     code: str | None  # digest of the file of the stage
     packages: dict[str, str]  # digests of the code of plug-ins by package
     notes: list[str]
+    rows: Json  # `StageRows`; missing in older records, and if the stage states nothing
+    stage_rows: dict[str, Json]  # rows of an acquired dataset up to this recording
+    columns: dict[str, list[str]]  # names of columns by stream, of a recording that was read from files
 
 
 class Summary(TypedDict, total=False):
-    """The code that computed several results, and the notes on them."""
+    """The code that computed several results, the notes on them, and the rows that they account for."""
 
     code: dict[str, dict[str, int]]  # number of results by stage and digest of its code
     packages: dict[str, dict[str, int]]  # number of results by package and digest of its code
     notes: dict[str, list[str]]  # names of recordings by note
+    stage_rows: dict[str, Json]  # `StageRows` by stage
 
 
 class RunProvenance(Environment, Summary):

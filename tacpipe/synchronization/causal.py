@@ -1,8 +1,8 @@
-"""Resample streams to a grid online, with the same rows that `synchronize` computes from complete streams.
+"""Synchronize streams online, with the same rows that `synchronize` computes from complete streams.
 
-A row has the newest sample of each stream at or before its grid point. Rows are computed up to a time that the caller
-passes when all samples up to it are pushed, so rows depend neither on the chunks of samples nor on the order of streams
-between two calls.
+A row at a sample of the master has the newest sample of each stream that had arrived by then and was measured by then.
+It is computed when all samples that arrived up to the master's sample were passed, which the caller states, so rows
+depend neither on the chunks of samples nor on the order of streams between two calls.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
+from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
 from tacpipe.signals.repairs import RANGE, count_wraps
-from tacpipe.signals.resampling import is_overdue, median_before, newest_rows, uniform_offsets
+from tacpipe.signals.resampling import is_overdue, median_before, newest_known_rows, uniform_offsets
+from tacpipe.signals.sampling import PlacedSamples
 from tacpipe.synchronization.columns import ONLINE_MEDIAN_NS
 
 INITIAL_ROWS = 256  # initial size of a buffer
+# Samples are kept for this time while the master is silent. After a longer silence, its samples are at their arrivals.
+HISTORY_NS = 60_000_000_000
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,11 @@ class StreamColumns:
 
 
 class GridRows(NamedTuple):
-    """Consecutive rows of a grid. `newest_ns`, `gap` and `values` are by stream."""
+    """Consecutive rows. `newest_ns`, `gap` and `values` are by stream."""
 
     t_ns: Times  # (row,)
+    arrival_ns: Times  # (row,), when the master's sample arrived; `t_ns` at a constant rate
+    at_arrival: Bools  # (row,): True if the sampling time is unknown, so that it is the arrival
     has_samples: Bools  # (row,): True if each stream has a sample; other rows are empty
     newest_ns: Mapping[str, Times]  # (row,): time of the newest sample
     gap: Mapping[str, Bools]  # (row,)
@@ -42,7 +47,7 @@ class GridRows(NamedTuple):
 
 
 class Grid:
-    """Rows of several streams on the grid of one of them, as from `synchronize` with held values."""
+    """Rows of several streams, as from `synchronize` with held values."""
 
     def __init__(
         self,
@@ -53,18 +58,18 @@ class Grid:
         gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
-        """Prepare a grid of the ``kind`` uniform, logged or fresh, whose points follow the stream ``master``.
+        """Prepare rows of the ``kind`` uniform, logged or fresh, at the samples of ``master`` or from its first arrival.
 
         ``streams`` are the columns that are read from each stream. A stream is in a gap if its newest sample is older than
-        ``gap_ns``. ``rate_hz`` is the rate of a uniform grid, None for others. ``origin_ns`` is the first point of an
-        earlier uniform grid to continue; by default, a grid starts at the master's first sample.
+        ``gap_ns``. ``rate_hz`` is the rate of uniform rows, None for others. ``origin_ns`` is the first point of an earlier
+        uniform grid to continue.
         """
         self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}
         self._master, self._kind, self._rate_hz, self._gap_ns = master, kind, rate_hz, gap_ns
         self._points = 0  # number of computed points of a uniform grid
-        self._until_ns: int | None = None  # time up to which rows are computed
-        self.late = dict.fromkeys(streams, 0)  # numbers of samples that arrived too late for their rows
+        self._row_arrival_ns: int | None = None  # arrival up to which rows are computed
+        self.late = dict.fromkeys(streams, 0)  # numbers of samples that were passed after their rows were computed
 
     def continue_from(self, stream: str, levels: AnyFloats) -> None:
         """Unwrap the first sample of a stream to the values nearest to ``levels`` (column,).
@@ -76,76 +81,72 @@ class Grid:
     @property
     def waiting(self) -> tuple[str, ...]:
         """The streams without samples."""
-        return tuple(name for name, source in self._sources.items() if source.first_ns is None)
+        return tuple(name for name, source in self._sources.items() if source.first_arrival_ns is None)
 
     @property
     def origin_ns(self) -> int | None:
-        """The first point of the grid, or None before the master's first sample."""
-        return self._sources[self._master].first_ns if self._origin_ns is None else self._origin_ns
+        """The first point of a uniform grid, or None before the master's first sample."""
+        return self._sources[self._master].first_arrival_ns if self._origin_ns is None else self._origin_ns
 
-    def push(self, stream: str, t_ns: Times, values: AnyFloats) -> None:
-        """Add samples of a stream, (time,) and (time, column), in the order of arrival.
+    def push(self, stream: str, arrival_ns: Times, placed: PlacedSamples, values: AnyFloats) -> None:
+        """Add samples of a stream with their arrivals (time,), as `Placement` places them, and values (time, column).
 
-        Samples whose time is before that of an earlier sample are dropped and counted in `late`. Samples within
-        already computed rows are counted, too.
+        Late samples have no effect. A sample that had arrived by an already computed row, which lacks it, is counted in
+        `late`.
         """
-        if not len(t_ns):
+        in_order = ~placed.late
+        if not in_order.any():
             return
-        source = self._sources[stream]
-        least_ns = int(t_ns[0]) if source.newest_ns is None else source.newest_ns
-        in_order = t_ns >= np.maximum.accumulate(np.maximum(t_ns, least_ns))
-        ordered_ns = t_ns[in_order]
-        self.late[stream] += len(t_ns) - len(ordered_ns)
-        if not len(ordered_ns):
-            return
-        if self._until_ns is not None and ordered_ns[0] <= self._until_ns:
-            self.late[stream] += int(np.count_nonzero(ordered_ns <= self._until_ns))
-        source.push(ordered_ns, values[in_order])
+        self._sources[stream].push(
+            placed.t_ns[in_order], arrival_ns[in_order], placed.at_arrival[in_order], values[in_order]
+        )
+        makes_rows = stream == self._master and self._rate_hz is None
+        if not makes_rows and self._row_arrival_ns is not None:
+            self.late[stream] += int(np.count_nonzero(arrival_ns[in_order] <= self._row_arrival_ns))
 
     def rows(self, until_ns: int) -> GridRows:
         """Return the new rows up to ``until_ns``, empty before each stream has a sample.
 
-        All samples up to this time must have been pushed.
+        All samples that arrived up to this time must have been pushed.
         """
-        after_ns, self._until_ns = self._until_ns, max(until_ns, self._until_ns or until_ns)
-        grid_ns = self._grid(after_ns, self._until_ns)
-        firsts = [source.first_ns for source in self._sources.values()]
-        first_stamps = [first for first in firsts if first is not None]
-        has_samples = grid_ns >= max(first_stamps) if len(first_stamps) == len(firsts) else np.zeros(len(grid_ns), bool)
-        at_ns = grid_ns[has_samples]
+        t_ns, arrival_ns, at_arrival = self._new_rows(until_ns)
+        if len(arrival_ns):
+            self._row_arrival_ns = int(arrival_ns[-1])
+        newest = {name: source.newest(arrival_ns, t_ns) for name, source in self._sources.items()}
+        has_samples = np.all([rows >= 0 for rows in newest.values()], axis=0)
         newest_ns, gap, values = {}, {}, {}
         for name, source in self._sources.items():
-            newest_ns[name], gap[name] = np.zeros(len(grid_ns), np.int64), np.zeros(len(grid_ns), bool)
-            values[name] = np.full((len(grid_ns), source.reading.width), np.nan)
-            if len(at_ns):
-                newest_ns[name][has_samples], values[name][has_samples] = source.at(at_ns)
+            newest_ns[name], gap[name] = np.zeros(len(t_ns), np.int64), np.zeros(len(t_ns), bool)
+            values[name] = np.full((len(t_ns), source.reading.width), np.nan)
+            if has_samples.any():
+                at_ns = t_ns[has_samples]
+                newest_ns[name][has_samples], values[name][has_samples] = source.at(newest[name][has_samples], at_ns)
                 gap[name][has_samples] = is_overdue(newest_ns[name][has_samples], at_ns, self._gap_ns[name])
-            source.forget(self._until_ns)
-        return GridRows(grid_ns, has_samples, newest_ns, gap, values)
+        needed_ns = until_ns
+        if self._rate_hz is None and (sampled_ns := self._sources[self._master].newest_ns) is not None:
+            needed_ns = max(min(until_ns, sampled_ns), until_ns - HISTORY_NS)
+        for source in self._sources.values():
+            source.forget(until_ns, needed_ns)
+        return GridRows(t_ns, arrival_ns, at_arrival, has_samples, newest_ns, gap, values)
 
-    def _grid(self, after_ns: int | None, until_ns: int) -> Times:
-        """Return the grid points after ``after_ns`` (None: from the first) up to ``until_ns`` (row,)."""
+    def _new_rows(self, until_ns: int) -> tuple[Times, Times, Bools]:
+        """Return times, arrivals and marks of the rows that are new, each (row,)."""
         master = self._sources[self._master]
-        if master.first_ns is None:
-            return np.zeros(0, np.int64)
-        if self._rate_hz is not None:
-            origin_ns = master.first_ns if self._origin_ns is None else self._origin_ns
+        if self._rate_hz is None:
+            return master.take_rows(until_ns, fresh=self._kind == "fresh")
+        first_ns = master.first_arrival_ns
+        if first_ns is None:
+            points = np.zeros(0, np.int64)
+        else:
+            origin_ns = first_ns if self._origin_ns is None else self._origin_ns
             if not self._points:  # points before the first sample belong to the earlier grid
-                self._points = max(0, int((master.first_ns - origin_ns) * self._rate_hz / 1e9) - 1)
+                self._points = max(0, int((first_ns - origin_ns) * self._rate_hz / 1e9) - 1)
             count = int((until_ns - origin_ns) * self._rate_hz / 1e9) + 2
             points = origin_ns + uniform_offsets(self._points, max(0, count - self._points), self._rate_hz)
             points = points[points <= until_ns]
             self._points += len(points)
-            points = points[points >= master.first_ns]
-            return points if after_ns is None else points[points > after_ns]
-        t_ns, repeated = master.stamps()
-        selected = t_ns <= until_ns
-        if after_ns is not None:
-            selected &= t_ns > after_ns
-        if self._kind == "fresh":
-            selected &= ~repeated
-        selected &= np.append(np.diff(t_ns) > 0, True)[: len(t_ns)]
-        return t_ns[selected]
+            points = points[points >= first_ns]
+        return points, points, np.zeros(len(points), bool)
 
 
 class _Source:
@@ -153,25 +154,28 @@ class _Source:
 
     def __init__(self, reading: StreamColumns) -> None:
         self.reading = reading
-        self.first_ns: int | None = None
-        self.newest_ns: int | None = None
+        self.first_arrival_ns: int | None = None
+        self.newest_ns: int | None = None  # sampling time of the newest sample
         self._wraps, self._compared, self._medians = (
             np.array(columns, np.intp) for columns in (reading.wraps, reading.compared, reading.medians)
         )
-        self._t_ns, self._values = np.zeros(INITIAL_ROWS, np.int64), np.zeros((INITIAL_ROWS, reading.width))
-        self._repeated = np.zeros(INITIAL_ROWS, bool)
+        self._t_ns, self._arrival_ns = np.zeros(INITIAL_ROWS, np.int64), np.zeros(INITIAL_ROWS, np.int64)
+        self._values = np.zeros((INITIAL_ROWS, reading.width))
+        self._repeated, self._at_arrival = np.zeros(INITIAL_ROWS, bool), np.zeros(INITIAL_ROWS, bool)
         self._start = self._stop = 0  # used rows of the buffers
+        self._next_row = 0  # row of the buffers up to which samples became rows
         self._before: AnyFloats | None = None  # (column,): the previous sample, unprocessed
         self._wrap_counts: Int64s = np.zeros(len(self._wraps), np.int64)
         self.levels: AnyFloats | None = None  # (column,): values near which the first sample is unwrapped
 
-    def push(self, t_ns: Times, values: AnyFloats) -> None:
-        """Add samples with non-decreasing times."""
+    def push(self, t_ns: Times, arrival_ns: Times, at_arrival: Bools, values: AnyFloats) -> None:
+        """Add samples that are not late."""
         previous = values[:1] if self._before is None else self._before[None]
         extended = np.concatenate([previous, values]) if len(self._wraps) or len(self._compared) else values
         self._reserve(len(t_ns))
         added_rows = slice(self._stop, self._stop + len(t_ns))
-        self._t_ns[added_rows], self._values[added_rows] = t_ns, values
+        self._t_ns[added_rows], self._arrival_ns[added_rows] = t_ns, arrival_ns
+        self._at_arrival[added_rows], self._values[added_rows] = at_arrival, values
         if self._before is None and self.levels is not None:
             distance = (self.levels - values[0])[self._wraps]
             self._wrap_counts = np.where(np.isfinite(distance), np.rint(distance / RANGE), 0).astype(np.int64)
@@ -186,28 +190,37 @@ class _Source:
         self._before = values[-1].copy()
         self._stop += len(t_ns)
         self.newest_ns = int(t_ns[-1])
-        self.first_ns = int(t_ns[0]) if self.first_ns is None else self.first_ns
+        self.first_arrival_ns = int(arrival_ns[0]) if self.first_arrival_ns is None else self.first_arrival_ns
 
-    def stamps(self) -> tuple[Times, Bools]:
-        """Return the times of the buffered samples (time,), and a mask of samples that repeat the previous one."""
-        filled = slice(self._start, self._stop)
-        return self._t_ns[filled], self._repeated[filled]
+    def take_rows(self, until_ns: int, *, fresh: bool) -> tuple[Times, Times, Bools]:
+        """Return times, arrivals and marks of the samples up to an arrival that were not taken yet, each (time,)."""
+        first = self._next_row
+        self._next_row += int(np.searchsorted(self._arrival_ns[first : self._stop], until_ns, side="right"))
+        rows = np.arange(first, self._next_row)
+        rows = rows[~self._repeated[rows]] if fresh else rows
+        return self._t_ns[rows], self._arrival_ns[rows], self._at_arrival[rows]
 
-    def at(self, grid_ns: Times) -> tuple[Times, Floats]:
-        """Return times (grid,) and values (grid, column) of the newest sample at each grid point."""
+    def newest(self, row_arrival_ns: Times, row_ns: Times) -> Indices:
+        """Return the newest buffered sample that each row knows (row,), or -1."""
+        buffered = slice(self._start, self._stop)
+        return newest_known_rows(self._arrival_ns[buffered], self._t_ns[buffered], row_arrival_ns, row_ns)
+
+    def at(self, newest: Indices, grid_ns: Times) -> tuple[Times, Floats]:
+        """Return times (row,) and values (row, column) of the samples ``newest`` (row,) of rows at ``grid_ns``."""
         buffered = slice(self._start, self._stop)
         t_ns, values = self._t_ns[buffered], self._values[buffered]
-        rows = newest_rows(t_ns, grid_ns)
-        samples: Floats = values[rows]
+        samples: Floats = values[newest]
         if len(self._medians):
-            samples[:, self._medians] = median_before(t_ns, values[:, self._medians], grid_ns, ONLINE_MEDIAN_NS)
-        return t_ns[rows], samples
+            samples[:, self._medians] = median_before(t_ns, values[:, self._medians], newest, grid_ns, ONLINE_MEDIAN_NS)
+        return t_ns[newest], samples
 
-    def forget(self, until_ns: int) -> None:
-        """Remove samples that no grid point after ``until_ns`` needs."""
-        newest = self._start + int(newest_rows(self._t_ns[self._start : self._stop], np.array([until_ns]))[0])
+    def forget(self, until_ns: int, needed_ns: int) -> None:
+        """Remove samples that no row needs that arrives after ``until_ns`` and was measured after ``needed_ns``."""
+        buffered = slice(self._start, self._stop)
+        times = np.array([until_ns]), np.array([needed_ns])
+        newest = self._start + int(newest_known_rows(self._arrival_ns[buffered], self._t_ns[buffered], *times)[0])
         if len(self._medians):
-            newest = min(newest, int(np.searchsorted(self._t_ns[: self._stop], until_ns - ONLINE_MEDIAN_NS)))
+            newest = min(newest, int(np.searchsorted(self._t_ns[: self._stop], needed_ns - ONLINE_MEDIAN_NS)))
         self._start = max(self._start, newest)
 
     def _reserve(self, count: int) -> None:
@@ -217,9 +230,10 @@ class _Source:
         buffered = slice(self._start, self._stop)
         length = self._stop - self._start
         capacity = max(len(self._t_ns), 2 * (length + count))
-        for name in ("_t_ns", "_values", "_repeated"):
+        for name in ("_t_ns", "_arrival_ns", "_at_arrival", "_values", "_repeated"):
             old = getattr(self, name)
             larger = np.zeros((capacity, *old.shape[1:]), old.dtype)
             larger[:length] = old[buffered]
             setattr(self, name, larger)
+        self._next_row -= self._start
         self._start, self._stop = 0, length

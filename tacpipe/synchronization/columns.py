@@ -22,11 +22,11 @@ from tacpipe.signals.resampling import (
     median_around,
     median_before,
     nearest_rows,
-    newest_rows,
+    newest_known_rows,
     slerp,
 )
 from tacpipe.synchronization import streams
-from tacpipe.synchronization.streams import TimedStream
+from tacpipe.synchronization.streams import RowTimes, TimedStream
 
 MEDIAN_NS = 10_000_000  # half the width of a median filter, whose full width contains eight readings at 400 Hz
 ONLINE_MEDIAN_NS = 2 * MEDIAN_NS  # width of a causal median filter with the same number of readings, delayed by 10 ms
@@ -55,7 +55,7 @@ class GridColumns:
     def __init__(
         self,
         stream: TimedStream,
-        grid_ns: Times,
+        grid: RowTimes,
         exact: Int64s | None,
         gap_ns: int,
         storage: MappedArrays,
@@ -64,19 +64,36 @@ class GridColumns:
     ) -> None:
         """Prepare the columns.
 
-        ``exact`` contains the row of each grid point, or is None if a grid point has no sample. ``storage`` may contain the
-        times of stream and grid.
+        ``exact`` contains the sample of each row to interpolate, or is None if a row has no sample. ``storage`` may contain
+        the times of stream and grid.
         """
-        self._stream, self._grid_ns, self._exact, self._gap_ns = stream, grid_ns, exact, gap_ns
+        self._stream, self._grid, self._grid_ns, self._exact, self._gap_ns = stream, grid, grid.t_ns, exact, gap_ns
         self._storage, self._hold_values = storage, hold_values
         self._rows = RowRanges(stream.columns)
         self._signs: dict[str, SignContinuation] = {}  # by name of a quaternion
+
+    def newest(self, points: slice) -> Indices:
+        """Return the sample that each row of a range holds (row,)."""
+        stream, grid = self._stream, self._grid
+        return newest_known_rows(stream.arrival_ns, stream.t_ns, grid.arrival_ns[points], grid.t_ns[points])
+
+    def used_samples(self) -> int:
+        """Return the number of samples from the first to the last that rows contain, held ones between them included."""
+        last, t_ns = len(self._grid_ns) - 1, self._stream.t_ns
+        if self._hold_values:
+            return int(self.newest(slice(last, None))[0] - self.newest(slice(0, 1))[0]) + 1
+        first = max(0, int(t_ns.searchsorted(self._grid_ns[0], side="right")) - 1)
+        return min(len(t_ns), int(t_ns.searchsorted(self._grid_ns[last])) + 1) - first
 
     def gaps(self) -> Bools:
         """Return the mask of grid points (grid,) in a gap."""
         mask = np.zeros(len(self._grid_ns), dtype=bool)
         for points in self._blocks():
-            mask[points] = _gap_mask(self._stream, self._grid_ns[points], self._gap_ns, hold_values=self._hold_values)
+            if self._hold_values:
+                newest_ns = self._stream.t_ns[self.newest(points)]
+                mask[points] = is_overdue(newest_ns, self._grid_ns[points], self._gap_ns)
+            else:
+                mask[points] = in_gap(self._stream.t_ns, self._grid_ns[points], self._gap_ns)
         return mask
 
     def extend_look_ahead(self, ahead_ns: Times) -> None:
@@ -97,8 +114,11 @@ class GridColumns:
         Ranges must be consecutive. Ground truth has no masks.
         """
         at_ns, t_ns = self._grid_ns[points], self._stream.t_ns
+        newest = self.newest(points) if self._hold_values else None
         first = max(0, int(t_ns.searchsorted(at_ns[0] - ONLINE_MEDIAN_NS)) - 1)
         stop = min(len(t_ns), int(t_ns.searchsorted(at_ns[-1] + MEDIAN_NS, side="right")) + 1)
+        if newest is not None:
+            first, stop = min(first, int(newest[0])), int(newest[-1]) + 1
         stream = replace(
             self._stream,
             columns=self._rows.read(first, stop),
@@ -106,9 +126,9 @@ class GridColumns:
             t_ns=t_ns[first:stop],
             repeated=self._stream.repeated[first:stop],
         )
-        if self._hold_values:
-            channels = _online_channels(stream, at_ns)
-            return channels + ([] if stream.truth else _online_masks(stream, at_ns, self._gap_ns))
+        if newest is not None:
+            channels = _online_channels(stream, newest - first, at_ns)
+            return channels + ([] if stream.truth else _online_masks(stream, newest - first, at_ns, self._gap_ns))
         exact = None if self._exact is None else self._exact[points] - first
         channels = _channels(stream, at_ns, exact, self._signs)
         return channels + ([] if stream.truth else _interpolated_masks(stream, at_ns, exact, self._gap_ns))
@@ -149,22 +169,21 @@ def _channels(
     return [grid_columns[name] for name in stream.channels]
 
 
-def _online_channels(stream: TimedStream, grid_ns: Times) -> list[GridColumn]:
-    """Return field and values of each channel on the grid, computed causally.
+def _online_channels(stream: TimedStream, newest: Indices, grid_ns: Times) -> list[GridColumn]:
+    """Return field and values of each channel in the rows at ``grid_ns``, computed causally.
 
-    The value is the newest sample, with the same type; for a proximity sensor, the median of the last
-    `ONLINE_MEDIAN_NS`. Each point needs a sample at or before it.
+    The value is that of the sample ``newest`` (row,), with the same type; for a proximity sensor, the median of the last
+    `ONLINE_MEDIAN_NS`.
     """
-    rows = newest_rows(stream.t_ns, grid_ns)
     grid_columns = []
     for name in stream.channels:
         if streams.method(stream.columns.schema, name) == "median":
             kind = streams.interpolated_type(stream.columns.schema.field(name).type)
             field = streams.grid_field(stream.name, stream.field(name), "median", kind)
-            values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, ONLINE_MEDIAN_NS)
+            values = median_before(stream.t_ns, stream.values(name)[:, None], newest, grid_ns, ONLINE_MEDIAN_NS)
             grid_columns.append(_to_column(field, values[:, 0]))
         else:
-            grid_columns.append(_channel_at_rows(stream, name, rows, "hold"))
+            grid_columns.append(_channel_at_rows(stream, name, newest, "hold"))
     return grid_columns
 
 
@@ -199,7 +218,7 @@ def _interpolated_masks(stream: TimedStream, grid_ns: Times, exact: Int64s | Non
     ``exact`` are the rows whose times are the grid points, or None.
     """
     rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
-    gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=False)
+    gap = in_gap(stream.t_ns, grid_ns, gap_ns)
     return _masks(stream.name, stream.repeated[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
 
 
@@ -213,18 +232,11 @@ def _look_ahead_ns(stream: TimedStream, grid_ns: Times, exact: Int64s | None) ->
     return look_ahead
 
 
-def _online_masks(stream: TimedStream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
-    """Return masks of repeated newest samples and of those older than ``gap_ns``, and the age of the newest sample in ns."""
-    rows = newest_rows(stream.t_ns, grid_ns)
-    gap = _gap_mask(stream, grid_ns, gap_ns, hold_values=True)
-    return _masks(stream.name, stream.repeated[rows], gap, grid_ns - stream.t_ns[rows])
-
-
-def _gap_mask(stream: TimedStream, grid_ns: Times, gap_ns: int, *, hold_values: bool) -> Bools:
-    """Return the mask of grid points (grid,) in a gap between samples, or after a sample that is too old."""
-    if hold_values:
-        return is_overdue(stream.t_ns[newest_rows(stream.t_ns, grid_ns)], grid_ns, gap_ns)
-    return in_gap(stream.t_ns, grid_ns, gap_ns)
+def _online_masks(stream: TimedStream, newest: Indices, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
+    """Return masks of repeated samples among ``newest`` (row,) and of those older than ``gap_ns``, and their age in ns."""
+    newest_ns = stream.t_ns[newest]
+    gap = is_overdue(newest_ns, grid_ns, gap_ns)
+    return _masks(stream.name, stream.repeated[newest], gap, grid_ns - newest_ns)
 
 
 def _masks(name: str, repeated: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:

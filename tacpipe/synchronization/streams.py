@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +14,17 @@ from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times, from
 from tacpipe.channels import arm
 from tacpipe.channels.streams import layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError
-from tacpipe.io.columns import Columns
+from tacpipe.io.columns import Columns, SelectedRows
 from tacpipe.io.spill import MappedArrays
 from tacpipe.plugins.stage import Attribute
 from tacpipe.signals.clocks import fit_clock, host_times
 from tacpipe.signals.repairs import HALF, RANGE, count_wraps
 from tacpipe.signals.resampling import uniform_offsets
+from tacpipe.signals.sampling import spread_times
+from tacpipe.synchronization.placement import Placement, are_arrivals
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Recording
 
 TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
@@ -109,10 +114,13 @@ class TimedStream:
     """A stream of a recording with sampling times on the host's clock."""
 
     name: str
-    columns: Columns
-    t_ns: Times  # (time,)
+    columns: Columns | SelectedRows  # columns of all samples that are not late
+    t_ns: Times  # (time,), increasing
     repeated: Bools  # (time,): True if a sample repeats the previous one
     arrival_ns: Times  # (time,): arrival times on the host's clock
+    at_arrival: Bools  # (time,): True if the sampling time is unknown, so that it is the arrival
+    late: int = 0  # number of samples that precede an earlier one
+    estimated_lost: int = 0  # number of lost samples that only the arrivals of later ones show
     attributes: dict[str, Attribute] = field(default_factory=dict)  # results of the clock fit
     wraps: Mapping[str, Wraps] = field(default_factory=dict)  # channels whose counts are unwrapped
     first_row: int = 0  # number of samples of the stream before these samples
@@ -160,29 +168,65 @@ def may_be_signal(schema: pa.Schema) -> bool:
     )
 
 
-def to_host_clock(recording: str, name: str, columns: Columns, clock: str, storage: MappedArrays) -> TimedStream:
-    """Return a stream with times on the host's clock. ``clock`` selects the times: device, arrival or auto.
+def place_stream(recording: Recording, name: str, columns: Columns, clock: str, storage: MappedArrays) -> TimedStream:
+    """Return a stream with sampling times on the host's clock, without late samples.
 
-    Times and repeats are kept in ``storage``. Raises `TacpipeError` if times are missing or decrease, or the device's clock
-    cannot be fitted.
+    Arrivals are placed by `Placement`, unless ``clock`` is device, or auto and there is a device clock: that clock is then
+    fitted to the whole recording. Times and masks are kept in ``storage``. Raises `TacpipeError` if times are missing or
+    decrease, or the device's clock cannot be fitted.
     """
-    arrival_ns = _stamps(recording, name, columns, storage)
-    stream = TimedStream(name, columns, arrival_ns, _repeated_rows(columns, storage), arrival_ns)
+    stamps_ns, equal_fraction = _stamps(recording.name, name, columns, storage)
+    arrivals = are_arrivals(columns.schema.field("t_ns"), recording.attributes, equal_fraction)
+    placement = Placement(columns.schema, arrivals=arrivals)
+    counters = [name for name in placement.columns if name != "t_ns" and not columns.column(name).null_count]
+    t_ns, arrival_ns = (storage.empty(stamps_ns.shape, np.int64) for _ in range(2))
+    at_arrival, late = (storage.empty(stamps_ns.shape, bool) for _ in range(2))
+    estimated_losses = 0
+    for rows, times in _time_blocks(columns, counters, stamps_ns):
+        arrival_ns[rows], placed = placement.place(times)
+        t_ns[rows], at_arrival[rows], late[rows] = placed.t_ns, placed.at_arrival, placed.late
+        estimated_losses += sum(loss.samples for loss in placed.losses)
+        storage.read(4 * arrival_ns[rows].nbytes)
+    remaining: Columns | SelectedRows = columns
+    if late.any():
+        remaining = SelectedRows(columns, ~late)
+        t_ns, arrival_ns, at_arrival = t_ns[~late], arrival_ns[~late], at_arrival[~late]
+    repeated = _repeated_rows(remaining, storage)
+    stream = TimedStream(name, remaining, t_ns, repeated, arrival_ns, at_arrival, int(late.sum()), estimated_losses)
     if clock == "arrival" or stream.truth:
         return stream
     if DEVICE not in columns.column_names:
         if clock == "device":
             raise TacpipeError(
-                f"Recording {recording}: stream {name!r} has no column {DEVICE}. Use `--clock auto`, which uses the "
+                f"Recording {recording.name}: stream {name!r} has no column {DEVICE}. Use `--clock auto`, which uses the "
                 f"device's clock if there is one, or `--clock arrival`."
             )
         return stream
-    t_ns, attributes = _convert_device_times(recording, name, columns, stream.t_ns)
-    return replace(stream, t_ns=storage.keep(t_ns), attributes=attributes)
+    device_ns, fitted = _convert_device_times(recording.name, name, remaining, arrival_ns)
+    return replace(
+        stream,
+        t_ns=storage.keep(spread_times(device_ns, None)),
+        at_arrival=np.zeros(len(device_ns), bool),
+        attributes=fitted,
+    )
+
+
+def _time_blocks(columns: Columns, counters: list[str], stamps_ns: Times) -> Iterator[tuple[slice, dict[str, Times]]]:
+    """Yield blocks of rows, with their stamps and the integer columns ``counters``, each (row,), by name."""
+    if not counters:
+        for first in range(0, len(stamps_ns), POINTS):
+            yield slice(first, first + POINTS), {"t_ns": stamps_ns[first : first + POINTS]}
+        return
+    first = 0
+    for batch in columns.batches(counters):
+        rows = slice(first, first + batch.num_rows)
+        values = {name: from_arrow(batch.column(name)).astype(np.int64, copy=False) for name in counters}
+        yield rows, {"t_ns": stamps_ns[rows], **values}
+        first = rows.stop
 
 
 def _convert_device_times(
-    recording: str, stream: str, columns: Columns, arrival_ns: Times
+    recording: str, stream: str, columns: Columns | SelectedRows, arrival_ns: Times
 ) -> tuple[Int64s, dict[str, Attribute]]:
     """Return the device times (time,) in ns of samples, converted to the host's clock, and attributes of the fit.
 
@@ -206,7 +250,7 @@ def _convert_device_times(
     }
 
 
-def _certain(columns: Columns) -> Bools | None:
+def _certain(columns: Columns | SelectedRows) -> Bools | None:
     """Return a mask (time,) of the rows whose arrival was not delayed, or None if none was delayed."""
     if UNCERTAIN not in columns.column_names:
         return None
@@ -214,29 +258,33 @@ def _certain(columns: Columns) -> Bools | None:
     return certain
 
 
-def _stamps(recording: str, stream: str, columns: Columns, storage: MappedArrays) -> Int64s:
-    """Return the arrival times (time,) in ns of a stream. Raises `TacpipeError` if there are none, or they decrease."""
+def _stamps(recording: str, stream: str, columns: Columns, storage: MappedArrays) -> tuple[Int64s, float]:
+    """Return the stamps (time,) in ns of a stream, and the fraction of them that equal the previous one.
+
+    Raises `TacpipeError` if there are none, or they decrease.
+    """
     if "t_ns" not in columns.column_names or not columns.num_rows:
         raise TacpipeError(
             f"Recording {recording}: stream {stream!r} has no rows with t_ns. Exclude the recording with "
             f"`tacpipe label --exclude`, or record it again."
         )
-    t_ns: Times = storage.empty((columns.num_rows,), columns.schema.field("t_ns").type.to_pandas_dtype())
-    first = 0
+    t_ns: Times = storage.empty((columns.num_rows,), np.int64)
+    first = equal = 0
     for batch in columns.batches(["t_ns"]):
         stop = first + batch.num_rows
         t_ns[first:stop] = from_arrow(batch.column("t_ns"))
         before = max(0, first - 1)
-        decreases = np.diff(t_ns[before:stop]) < 0
-        if decreases.any():
-            row = before + int(decreases.argmax()) + 1
+        steps_ns = np.diff(t_ns[before:stop])
+        if (steps_ns < 0).any():
+            row = before + int((steps_ns < 0).argmax()) + 1
             raise TacpipeError(
                 f"Recording {recording}: the time of stream {stream!r} runs backwards at row {row} (counted from 0), from "
                 f"{t_ns[row - 1]} to {t_ns[row]} ns. Repair its clock at the source, or exclude the recording."
             )
+        equal += int((steps_ns == 0).sum())
         first = stop
         storage.read(batch.nbytes)
-    return t_ns
+    return t_ns, equal / len(t_ns)
 
 
 def unwrap_counts(stream: TimedStream) -> TimedStream:
@@ -249,7 +297,7 @@ def unwrap_counts(stream: TimedStream) -> TimedStream:
     return replace(stream, wraps=_find_wraps(stream.columns, names)) if names else stream
 
 
-def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
+def _find_wraps(columns: Columns | SelectedRows, names: Sequence[str]) -> dict[str, Wraps]:
     """Return the counter wraps of each channel that has any. Channels with empty rows are not checked."""
     steps: dict[str, list[tuple[Int64s, Int32s]]] = {name: [] for name in names}
     last_counts: dict[str, int] = {}  # count in the row before a batch
@@ -274,7 +322,7 @@ def _find_wraps(columns: Columns, names: Sequence[str]) -> dict[str, Wraps]:
     return wraps
 
 
-def _repeated_rows(columns: Columns, storage: MappedArrays) -> Bools:
+def _repeated_rows(columns: Columns | SelectedRows, storage: MappedArrays) -> Bools:
     """Return a mask (time,) of rows that repeat the previous row in all channels except labels, which are often constant."""
     names = [name for name in channel_names(columns.schema) if method(columns.schema, name) != "nearest"]
     repeated: Bools = storage.empty((columns.num_rows,), bool)
@@ -313,7 +361,15 @@ def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> 
     raise TacpipeError(f"{reason} Or choose the master with --master: {join_names(schemas)}.")
 
 
-def grid(
+class RowTimes(NamedTuple):
+    """The rows of a synchronized recording, and the samples or points that they are at."""
+
+    t_ns: Times  # (row,)
+    arrival_ns: Times  # (row,), when all samples of the row had arrived; `t_ns` at a constant rate
+    numbers: Int64s  # (row,), sample of the master, or point of the uniform grid
+
+
+def find_rows(
     recording: str,
     kind: str,
     rate_hz: float | None,
@@ -322,38 +378,40 @@ def grid(
     storage: MappedArrays,
     *,
     hold_values: bool,
-) -> tuple[Int64s, Int64s]:
-    """Return the grid points (grid,) in ns within all streams, and their rows in the master or in the uniform grid.
+) -> RowTimes:
+    """Return the rows within all streams: samples of the master, or points of a uniform grid from its first arrival.
 
-    A uniform grid starts at the master's first sample. With ``hold_values`` the grid ends with the last stream, because
-    online the last sample of a stream is unknown, and equal times become one point. The results are stored in ``storage``.
-    Raises `TacpipeError` if there are no points.
+    With ``hold_values``, rows begin when each stream has a sample that had arrived and was measured by then, and end with
+    the master. Otherwise they end with the first stream that ends. The results are stored in ``storage``. Raises
+    `TacpipeError` if there are no rows.
     """
-    first_ns = max(int(stream.t_ns[0]) for stream in streams.values())
-    last_ns = (max if hold_values else min)(int(stream.t_ns[-1]) for stream in streams.values())
-    origin_ns, count = int(master.t_ns[0]), len(master.t_ns)
-    if rate_hz is not None:
-        count = max(0, int((last_ns - origin_ns) * rate_hz / 1e9) + 2)
-    grid_ns, rows = (storage.empty((count,), dtype) for dtype in (master.t_ns.dtype, np.int64))
-    points = 0
+    firsts = [(int(stream.arrival_ns[0]), int(stream.t_ns[0])) for stream in streams.values()]
+    first_arrival_ns, first_ns = (max(times) for times in zip(*firsts, strict=True))
+    last_ns = int(master.arrival_ns[-1])
+    if not hold_values:
+        last_ns = min(int(stream.t_ns[-1]) for stream in streams.values())
+    origin_ns = int(master.arrival_ns[0]) if hold_values else int(master.t_ns[0])
+    count = len(master.t_ns) if rate_hz is None else max(0, int((last_ns - origin_ns) * rate_hz / 1e9) + 2)
+    t_ns, arrival_ns, numbers = (storage.empty((count,), np.int64) for _ in range(3))
+    row_count = 0
     for first in range(0, count, POINTS):
-        stop = min(first + POINTS, count)
-        if rate_hz is not None:
-            block_ns = origin_ns + uniform_offsets(first, stop - first, rate_hz)
+        block = slice(first, min(first + POINTS, count))
+        if rate_hz is None:
+            block_ns, arrivals = master.t_ns[block], master.arrival_ns[block]
         else:
-            block_ns = master.t_ns[first:stop]
-        is_point = (block_ns >= first_ns) & (block_ns <= last_ns)
+            block_ns = arrivals = origin_ns + uniform_offsets(first, block.stop - first, rate_hz)
+        if hold_values:
+            is_row = (arrivals >= first_arrival_ns) & (block_ns >= first_ns) & (arrivals <= last_ns)
+        else:
+            is_row = (block_ns >= first_ns) & (block_ns <= last_ns)
         if kind == "fresh":
-            is_point &= ~master.repeated[first:stop]
-        if hold_values and rate_hz is None:
-            steps_ns = np.diff(master.t_ns[first : stop + 1])
-            is_point[: len(steps_ns)] &= steps_ns > 0
-        selected = np.flatnonzero(is_point)
-        grid_ns[points : points + len(selected)] = block_ns[selected]
-        rows[points : points + len(selected)] = first + selected
-        points += len(selected)
-        storage.read(4 * block_ns.nbytes)
-    if not points:
+            is_row &= ~master.repeated[block]
+        selected = np.flatnonzero(is_row)
+        added = slice(row_count, row_count + len(selected))
+        t_ns[added], arrival_ns[added], numbers[added] = block_ns[selected], arrivals[selected], first + selected
+        row_count = added.stop
+        storage.read(5 * block_ns.nbytes)
+    if not row_count:
         latest = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
         earliest = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
@@ -361,31 +419,20 @@ def grid(
             f"starts last, at {printable.moment(int(latest.t_ns[0]))}, and {earliest.name} ends first, at "
             f"{printable.moment(int(earliest.t_ns[-1]))}. Exclude one of them with --without, or check their clocks."
         )
-    return grid_ns[:points], rows[:points]
+    return RowTimes(t_ns[:row_count], arrival_ns[:row_count], numbers[:row_count])
 
 
-def rows_at(t_ns: Times, grid_ns: Times, grid_rows: Int64s, storage: MappedArrays) -> Int64s | None:
-    """Return the rows whose times equal the grid points, or None if a grid point has no sample.
+def rows_at(t_ns: Times, grid_ns: Times, storage: MappedArrays) -> Int64s | None:
+    """Return the samples whose times ``t_ns``, which increase, equal the grid points, or None if a point has no sample.
 
-    ``grid_rows`` (grid,) are the rows of a stream with the same clock as the grid, which may repeat times. The result is
-    kept in ``storage``.
+    The result is kept in ``storage``.
     """
-
-    def shifted(block: slice) -> Int64s:
-        return np.asarray(grid_rows[block] + (t_ns.searchsorted(grid_ns[0]) - grid_rows[0]))
-
-    def first_rows(block: slice) -> Int64s:
-        return t_ns.searchsorted(grid_ns[block]).astype(np.int64)
-
-    for search in (shifted, first_rows):
-        exact = storage.empty(grid_ns.shape, np.int64)
-        for first in range(0, len(grid_ns), POINTS):
-            block = slice(first, first + POINTS)
-            rows = search(block)
-            if rows[-1] >= len(t_ns) or not np.array_equal(t_ns[rows], grid_ns[block]):
-                break
-            exact[block] = rows
-            storage.read(4 * rows.nbytes)
-        else:
-            return exact
-    return None
+    exact = storage.empty(grid_ns.shape, np.int64)
+    for first in range(0, len(grid_ns), POINTS):
+        block = slice(first, first + POINTS)
+        rows = t_ns.searchsorted(grid_ns[block])
+        if rows[-1] >= len(t_ns) or not np.array_equal(t_ns[rows], grid_ns[block]):
+            return None
+        exact[block] = rows
+        storage.read(4 * rows.nbytes)
+    return exact

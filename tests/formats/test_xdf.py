@@ -303,3 +303,110 @@ def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, mon
     streams = read(tmp_path / "run.xdf").streams["force"]
     assert isinstance(streams, pa.RecordBatchReader)
     assert streams.read_all().equals(expected, check_metadata=True)
+
+
+TRUE_S = 5000 + np.arange(1000) / 100
+
+
+def skin(stamps_s: Any, with_offsets: bool = True) -> Writer:
+    """Return a file of one stream with these stamps; its clock is that of the recorder."""
+    writer = Writer()
+    writer.stream(1, "Skin", "int32")
+    writer.numbers(1, "int32", stamps_s.tolist(), np.arange(len(stamps_s))[:, None])
+    for reading in TRUE_S[::400] if with_offsets else ():
+        writer.offset(1, reading, 0.0)
+    return writer
+
+
+@pytest.mark.parametrize("with_offsets", [True, False])
+@pytest.mark.parametrize(
+    "jumps",
+    [
+        [(400, 700, 2e5)],
+        [(400, 700, -2e5)],
+        [(100, 900, 2e5)],
+        [(500, 501, 2e5)],
+        [(500, 501, 0.5)],
+        [(999, 1000, 2e5)],
+        [(0, 1, 2e5)],
+        [(200, 300, 2e5), (600, 700, -1e3)],
+        [(300, 600, 2e5), (400, 500, 1e5)],
+        [(300, 500, 100), (500, 700, -100)],
+        [(400, 700, 0.5)],
+    ],
+)
+def test_a_clock_that_jumps_and_comes_back_changes_no_other_time(
+    tmp_path: Path, jumps: list[tuple[int, int, float]], with_offsets: bool
+) -> None:
+    stamps_s = TRUE_S.copy()
+    for start, stop, jump_s in jumps:
+        stamps_s[start:stop] += jump_s
+    count = np.count_nonzero(stamps_s != TRUE_S)
+    result = read(skin(stamps_s, with_offsets).write(tmp_path / "a.xdf"))
+    table = result.streams["Skin"]
+    assert np.abs(stamps(table) / 1e9 - TRUE_S).max() < 1e-6
+    assert np.abs(stamps(table, "t_device_ns") / 1e9 - stamps_s).max() < 1e-6
+    assert f"has {count:,} stamps that jump" in " ".join(result.notes)
+
+
+def test_pauses_and_samples_out_of_order_are_no_jumps(tmp_path: Path) -> None:
+    stamps_s = TRUE_S + 30 * (np.arange(1000) > 300) + 0.3 * (np.arange(1000) > 305)
+    stamps_s[[600, 601]] = stamps_s[[601, 600]]
+    result = read(skin(stamps_s).write(tmp_path / "a.xdf"))
+    assert np.abs(stamps(result.streams["Skin"]) / 1e9 - np.maximum.accumulate(stamps_s)).max() < 1e-6
+    assert "jump" not in " ".join(result.notes)
+
+
+def parts(path: Path, spans: list[tuple[int, int, int, str]], value: int | None = None) -> RecordingOutput:
+    """Write streams named Skin with these first and last samples, channels and computers; return what is read."""
+    writer = Writer()
+    for number, (start, stop, channels, host) in enumerate(spans, 1):
+        writer.stream(number, "Skin", "int32", channels, host=host)
+        writer.offset(number, TRUE_S[start], 0.0)
+        values = np.full((stop - start, channels), number if value is None else value)
+        writer.numbers(number, "int32", TRUE_S[start:stop].tolist(), values)
+    return read(writer.write(path))
+
+
+def test_the_streams_of_an_outlet_that_restarted_are_one_with_gaps(tmp_path: Path) -> None:
+    spans = [(600, 700, 2, "pc"), (0, 200, 2, "pc"), (300, 500, 2, "pc")]
+    result = parts(tmp_path / "a.xdf", spans)
+    assert set(result.streams) == {"Skin", "Skin_clock_offsets"}
+    ordered = sorted(spans)
+    expected = np.concatenate([TRUE_S[start:stop] for start, stop, _, _ in ordered])
+    assert np.abs(stamps(result.streams["Skin"]) / 1e9 - expected).max() < 1e-6
+    numbers = [number for number, count in ((2, 200), (3, 200), (1, 100)) for _ in range(count)]
+    assert result.streams["Skin"].column("value01").to_pylist() == numbers
+    assert result.streams["Skin_clock_offsets"].num_rows == 3
+    assert any("1.010 s, 1.010 s" in note for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("second", "part"),
+    [
+        ((350, 900, 2, "pc"), "0.490 s before"),
+        ((600, 900, 3, "pc"), "2.010 s after"),
+        ((600, 900, 2, "laptop"), "2.010 s after"),
+    ],
+)
+def test_streams_of_one_name_that_are_not_one_outlet_stay_apart_with_a_note(
+    tmp_path: Path, second: tuple[int, int, int, str], part: str
+) -> None:
+    result = parts(tmp_path / "a.xdf", [(0, 400, 2, "pc"), second])
+    assert [result.streams[name].num_rows for name in ("Skin_1", "Skin_2")] == [400, second[1] - second[0]]
+    assert any(part in note and "--without" in note for note in result.notes)
+
+
+def test_a_stream_that_was_recorded_twice_is_noted_and_two_sensors_are_not(tmp_path: Path) -> None:
+    twice = parts(tmp_path / "a.xdf", [(0, 900, 2, "pc")] * 2, value=7)
+    assert any("recorded twice" in note for note in twice.notes)
+    assert not parts(tmp_path / "a.xdf", [(0, 900, 2, "pc")] * 2).notes
+
+
+def test_a_restarted_outlet_of_many_samples_is_read_as_of_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spans = [(0, 200, 2, "pc"), (300, 500, 2, "pc")]
+    expected = parts(tmp_path / "a.xdf", spans).streams["Skin"]
+    monkeypatch.setattr(xdf_streams, "SPILL_ROWS", 64)
+    streams = parts(tmp_path / "a.xdf", spans).streams["Skin"]
+    assert isinstance(streams, pa.RecordBatchReader)
+    assert streams.read_all().equals(expected, check_metadata=True)

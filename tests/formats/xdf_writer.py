@@ -45,6 +45,7 @@ class Writer:
         rate_hz: float = 100.0,
         labels: Sequence[tuple[str, str, str]] = (),
         type_: str = "Force",
+        host: str = "",
     ) -> None:
         """Describe a stream; ``labels`` are label, unit and type of each channel."""
         described = "".join(
@@ -53,7 +54,7 @@ class Writer:
         )
         text = (
             "<?xml "
-            f"version='1.0'?><info><name>{name}</name><type>{type_}</type><channel_count>{channels}</channel_count><nominal_srate>{rate_hz:g}</nominal_srate><channel_format>{kind}</channel_format><source_id>s{number}</source_id><desc><channels>{described}</channels></desc></info>"
+            f"version='1.0'?><info><name>{name}</name><type>{type_}</type><channel_count>{channels}</channel_count><nominal_srate>{rate_hz:g}</nominal_srate><channel_format>{kind}</channel_format><source_id>s{number}</source_id><hostname>{host}</hostname><desc><channels>{described}</channels></desc></info>"
         )
         self.parts.append(chunk(2, text.encode(), number))
 

@@ -52,6 +52,7 @@ class Persistence:
         if not {name.removeprefix("skin_") for name in CHANNELS} <= names:
             raise UsageError("The model reads 16 taxels of the stream skin, and the rig's skin has another layout.")
         self.late = {"skin": 0}
+        self.rest_rows = "unknown"
         self._samples: list[tuple[int, Any]] = []
         self.beginning, self.quantiles = beginning, np.array(quantiles, np.float32)
         self._next_ns: int | None = None

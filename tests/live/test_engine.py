@@ -29,6 +29,7 @@ class Session:
     def __init__(self, count: int = 200) -> None:
         self.sensor: Sensor = rigs.build_sensor("xela", {"rate_hz": 50}, "skin")
         self.engine = ForecastEngine({"skin": self.sensor}, Persistence, settle_ns=SETTLE_NS)
+        self.engine.resting_ns = 0
         samples = made.samples("xela", self.sensor, count, 1)
         self.values = np.hstack(samples.values).astype(np.float32)
         self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
@@ -87,7 +88,7 @@ def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> 
     session = Session()
     opened = functools.partial(Persistence, quantiles=(10, 90))
     engine = ForecastEngine({"skin": session.sensor}, opened, (1, 3), quantiles=(10, 90))
-    session.engine = engine
+    session.engine, engine.resting_ns = engine, 0
     session.begin()
     session.send(0, 1)
     (message,) = session.at(0)

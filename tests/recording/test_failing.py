@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.links.link import LinkLostError
 from tacpipe.recording import clock, sealing, station, triggers
 from tacpipe.recording import rig as rig_of
+from tacpipe.recording.losses import StreamLosses
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.spool_folders import RecordingHeader
@@ -154,7 +156,7 @@ def test_a_stream_that_falls_silent_before_the_end_says_so(tmp_path: Path) -> No
     sealed = sealing.seal(read, rig_of.parse(RIG))
 
     assert [(event.cause, event.frames) for event in sealed["a"].events] == [("silent", 3000)]
-    assert sealed["a"].lost == 3000 and not sealed["b"].events
+    assert sealed["a"].losses == StreamLosses(estimated=3000) and sealed["a"].lost == 0 and not sealed["b"].events
 
 
 def test_a_stream_that_was_lost_when_the_recording_began_says_so(
@@ -251,3 +253,38 @@ def test_a_key_that_nobody_can_press_is_refused(monkeypatch: pytest.MonkeyPatch)
             assert pressed() is False
             with pytest.raises(UsageError):
                 pressed(must=True)
+
+
+def test_what_arrived_before_the_end_is_recorded_though_it_is_read_after_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sent = frames(3)
+    is_reading, has_ended = threading.Event(), threading.Event()
+
+    class Late(Link):
+        """A link whose last packet waits in the system while the reader lingers."""
+
+        def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
+            if len(self.incoming) == 1 and not has_ended.is_set():
+                arrival_ns = time.monotonic_ns()
+                is_reading.set()
+                has_ended.wait(300)
+                return [(arrival_ns, self.incoming.pop())]
+            return super().read(timeout_s)
+
+    recorder = opened(monkeypatch, {"a": [Late(list(sent))], "b": [Link([])]})
+    sleep = clock.sleep
+
+    def end_and_sleep(pause_s: float) -> None:
+        has_ended.set()
+        sleep(pause_s)
+
+    with recorder.open():
+        spool = Spool(tmp_path, {"rig": RIG}, ["a", "b"])
+        with recorder.recording(spool, preroll=True):
+            until(is_reading.is_set, recorder)
+            monkeypatch.setattr(clock, "sleep", end_and_sleep)
+        spool.close()
+    sealed = sealing.seal(Spooled(spool.folder), rig_of.parse(RIG))["a"]
+
+    assert sealed.table.column("seq").to_pylist()[-1] == 2

@@ -68,7 +68,7 @@ def test_a_dry_run_tells_rates_and_writes_nothing(lab: Lab, script: Script) -> N
     report = json.loads(lab.run("acquire rig.toml --dry-run --json").out)
     assert report["schema_version"] == 1
     (figures,) = report["streams"].values()
-    assert set(figures) == {"rate_hz", "jitter_ms", "latency_ms", "samples", "lost", "bytes_lost"}
+    assert set(figures) == {"rate_hz", "jitter_ms", "latency_ms", "samples", "lost", "lost_estimated", "bytes_lost"}
     assert figures["rate_hz"] == pytest.approx(RATE_HZ) and (figures["lost"], figures["bytes_lost"]) == (0, 0)
     assert sorted(lab.folder.rglob("*")) == before
 

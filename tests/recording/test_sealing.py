@@ -14,13 +14,14 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.store.store import Store
 from tests import peaks
+from tests.conftest import Lab
 
 RIG = '[[stream]]\nname = "robot"\nsensor = "franka"\ntransport = "tcp+udp:172.16.0.2:1337"\n'
 BLOCK = 1000
 
 
-def record(store: Store, seconds: int, output: str = "rec") -> Spooled:
-    """Return the spool of an arm that sent a state every millisecond."""
+def record(store: Store, seconds: int, output: str = "rec", repeated: int = 0) -> Spooled:
+    """Return the spool of an arm that sent a state every millisecond, and the last of each second ``repeated`` times."""
     sensor = rig_of.parse(RIG).streams["robot"].sensor
     spool = Spool(store.root, {"output": output, "recording": "r", "attributes": {}, "rig": RIG}, ["robot"])
     for second in range(seconds):
@@ -30,7 +31,10 @@ def record(store: Store, seconds: int, output: str = "rec") -> Spooled:
         unit_floats = np.ones((BLOCK, 1), dtype=np.float32)
         zeros = np.zeros((BLOCK, 3), dtype=np.uint8), np.zeros((BLOCK, 2), dtype=np.uint64)
         data = sensor.encode(Samples((floats, unit_floats, *zeros), seq=count)).tobytes()
-        spool.append("robot", Chunks(count * 1_000_000, np.full(BLOCK, len(data) // BLOCK), data))
+        size = len(data) // BLOCK
+        spool.append("robot", Chunks(count * 1_000_000, np.full(BLOCK, size), data))
+        for _ in range(repeated):
+            spool.append("robot", Chunks(count[-1:] * 1_000_000, np.full(1, size), data[-size:]))
         spool.write()
     spool.close()
     return Spooled(spool.folder)
@@ -63,3 +67,22 @@ def test_a_sealed_stream_has_the_bytes_of_its_table(tmp_path: Path) -> None:
     (stored,) = (tmp_path / "rec" / "r").glob("robot.parquet")
     assert stored.read_bytes() == parquet.to_parquet(sealed["robot"].table)
     assert bytes_digest(stored.read_bytes()) in {path.name for path in (tmp_path / ".tacpipe/objects").rglob("*")}
+
+
+def test_samples_that_came_twice_are_counted_over_all_recordings_of_a_dataset(lab: Lab) -> None:
+    rig = rig_of.parse(RIG)
+    for repeated in (2, 0, 1):
+        spooled = record(lab.store, 1, repeated=repeated)
+        with lab.store.at_work():
+            appending.append(lab.store, lab.folder / "rec", spooled, rig, sealing.seal(spooled, rig))
+
+    lab.run("label rec r --label material=cork")
+    assert lab.run_json("show rec")["counted"] == {
+        "stages": {
+            "acquire": {
+                "results": 3,
+                "streams": {"robot": {"read": 3 * BLOCK + 3, "used": 3 * BLOCK, "unused": {"received before": 3}}},
+            }
+        },
+        "uncounted": 0,
+    }

@@ -92,10 +92,9 @@ def test_clean_bytes_are_given_out_whole_however_they_are_cut(kind: str, seed: i
     runs, losses = fed(framer, b"".join(sent), sizes)
 
     head = int(kind == "tailed")  # Its start is only known after a tail.
-    last = KINDS[kind].confirm if KINDS[kind].check is None else 0
-    assert frames_of(runs) == sent[head : len(sent) - last]
+    assert frames_of(runs) == sent[head:]
     assert framer.account.pending == 0
-    assert {loss.cause for loss in losses} <= {framing.START, framing.UNCONFIRMED}
+    assert {loss.cause for loss in losses} <= {framing.START}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -272,8 +271,8 @@ def test_marks_in_a_payload_that_holds_still_give_nothing_until_it_moves() -> No
     runs, losses = fed(framer, b"".join(moving), [50])
 
     assert not quiet
-    assert frames_of(runs) == repeating[1:] + moving[:-1]
-    assert [loss.cause for loss in losses] == [framing.START, framing.UNCONFIRMED]
+    assert frames_of(runs) == repeating[1:] + moving
+    assert [loss.cause for loss in losses] == [framing.START]
 
 
 def test_garbage_without_end_is_thrown_away_and_not_kept() -> None:
@@ -304,7 +303,7 @@ def test_a_line_that_is_none_is_lost_and_the_others_stay() -> None:
     runs, losses = fed(framer, b"34\n12\n1x\r\n99\r\n7", [4])
 
     assert frames_of(runs) == [b"12", b"99"] or frames_of(runs) == [b"34", b"12", b"99"]
-    assert (losses[-2].cause, losses[-1].cause) == (framing.GARBLED, framing.CUT)
+    assert [(loss.cause, loss.frames) for loss in losses[-2:]] == [(framing.GARBLED, 1), (framing.END, 0)]
     assert framer.account.pending == 0
 
 

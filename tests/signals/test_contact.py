@@ -108,7 +108,9 @@ def touch(rows: int, peak: float, noise: float, seed: int = 0) -> tuple[np.ndarr
 
 
 def thresholds(values: np.ndarray, t_ns: np.ndarray) -> tuple[float, float]:
-    return noise_thresholds(repeated_rows(values), load(values, rest_level(values, t_ns, 0.2)), t_ns, 0.2)
+    return noise_thresholds(
+        repeated_rows(values), load(values, rest_level(values, t_ns, 0.2)), t_ns <= t_ns[0] + 200_000_000
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-6, 0.004, 1.0, 5000.0])

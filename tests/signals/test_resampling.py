@@ -154,7 +154,8 @@ def test_the_newest_row_is_the_last_that_is_not_after_the_point(t_ns: np.ndarray
 def test_a_median_of_the_past_has_the_samples_of_its_span_or_the_newest() -> None:
     t_ns = EPOCH_NS + np.array([0, 10, 20, 30, 100])
     values = np.array([[5.0], [1.0], [9.0], [2.0], [4.0]])
-    medians = resampling.median_before(t_ns, values, EPOCH_NS + np.array([0, 20, 35, 99, 100]), 20)
+    grid_ns = EPOCH_NS + np.array([0, 20, 35, 99, 100])
+    medians = resampling.median_before(t_ns, values, resampling.newest_rows(t_ns, grid_ns), grid_ns, 20)
     assert medians[:, 0].tolist() == [5.0, 5.0, 5.5, 2.0, 4.0]
 
 

@@ -108,7 +108,7 @@ def errors(trial: int, clock: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return fingers, arm
 
 
-def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_they_are_not() -> None:
+def test_signals_are_near_the_truth_with_the_fitted_and_with_the_estimated_clock() -> None:
     errors_by_clock = {clock: [errors(trial, clock) for trial in range(8)] for clock in ("auto", "arrival")}
     fingers, arms = (
         {
@@ -118,9 +118,8 @@ def test_on_the_grid_signals_are_within_a_percent_of_the_truth_and_by_arrival_th
         for i in (0, 1)
     )
     assert fingers["auto"] < 0.01
-    assert arms["auto"] < 0.0005
-    assert arms["arrival"] > 5 * arms["auto"]
-    assert fingers["arrival"] > fingers["auto"]
+    assert fingers["arrival"] < 0.02
+    assert max(arms.values()) < 0.0005
 
 
 def test_held_frames_are_found() -> None:

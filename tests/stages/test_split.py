@@ -1,14 +1,18 @@
 """Test the table that the split stage writes."""
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import pyarrow as pa
 import pytest
 
+import tacpipe
+from tacpipe.datasets import selection
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
-from tests.fake_recordings import FakeDataset
+from tests.conftest import Lab
+from tests.fake_recordings import FakeDataset, write_dataset
 from tests.stage_params import build_params
 
 split = load("split")
@@ -91,3 +95,64 @@ def test_a_split_with_validation_recordings_or_asked_for_without_has_no_note(
     params: dict[str, Any], count: int, shard: Recording
 ) -> None:
     assert split(build_params("split", **params), dataset(shard, count)).notes == []
+
+
+def roles_of(path: str) -> dict[tuple[str, int], str]:
+    rows = tacpipe.open(path)["split"].table().to_pylist()
+    return {(row["recording"], row["fold"]): row["role"] for row in rows}
+
+
+def numbers(values: list[int]) -> dict[str, pa.Table]:
+    return {"skin": pa.table({"t_ns": range(len(values)), "taxel1": values})}
+
+
+@pytest.fixture
+def copies(lab: Lab) -> Lab:
+    """A project with ten recordings ``plain``, and ``copied``, the same with copies of three of them."""
+    plain = {f"t{i}": (numbers([i, i + 1]), {"object": str(i % 5)}) for i in range(10)}
+    write_dataset(lab.folder / "plain", plain)
+    write_dataset(lab.folder / "copied", plain | {f"z{i}": plain[f"t{i}"] for i in range(3)})
+    return lab
+
+
+@pytest.mark.parametrize("options", ["", "--scheme kfold", "--scheme leave-one-out", "--scheme blocked", "--few 3"])
+def test_recordings_with_equal_content_have_one_role_and_a_note_names_them(options: str, copies: Lab) -> None:
+    ran = copies.run(f"split copied -o split {options}")
+    assert "3 recordings have the content of another one, and have its role: t0 = z0, t1 = z1, t2 = z2." in ran.err
+    roles = roles_of("split")
+    assert all(roles[f"t{i}", fold] == roles[f"z{i}", fold] for i in range(3) for _, fold in roles)
+    assert "0 ran, 1 reused" in copies.run(f"split copied -o split {options}").err
+
+
+def test_only_equal_content_that_would_be_separated_and_a_group_that_is_given_enter_the_key(copies: Lab) -> None:
+    def identities() -> list[Any]:
+        records = [json.loads(path.read_text()) for path in (copies.folder / ".tacpipe").rglob("*.json")]
+        return [record["identity"] for record in records if record.get("identity", {}).get("stage") == "split"]
+
+    copies.run("split plain -o split")
+    copies.run("split copied -o split-authors --scheme blocked --stratify object --test 0 --val 0")
+    assert [set(identity["inputs"]) - {"recordings", "extend"} for identity in identities()] == [set(), set()]
+    assert not any("group" in identity["params"] for identity in identities())
+    copies.run("split copied -o split-copied")
+    copies.run("split plain -o split-grouped --group object")
+    assert sum("equal" in identity["inputs"] for identity in identities()) == 1
+    assert [identity["params"]["group"] for identity in identities() if "group" in identity["params"]] == ["object"]
+
+
+def test_a_split_stored_before_copies_stayed_together_is_not_used(copies: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(selection, "equal_recordings", lambda entries: [])
+        copies.run("split copied -o older")
+    older = roles_of("older")
+    separate = [f"t{i} = z{i}" for i in range(3) if older[f"t{i}", 0] != older[f"z{i}", 0]]
+    assert separate
+    assert "1 ran" in copies.run("split copied -o split").err
+    extended = copies.run("split copied -o extended --extend older")
+    assert f"keep different roles of the split to extend: {', '.join(separate)}." in extended.err
+    assert roles_of("extended") == older
+
+
+def test_apart_divides_groups_so_both_are_refused(copies: Lab) -> None:
+    ran = copies.call("split plain -o split --scheme kfold --apart object --group object")
+    assert ran.code == 2
+    assert "apart divides groups" in ran.err

@@ -212,7 +212,7 @@ def late(seconds: int = 10) -> tuple[pa.Table, np.ndarray]:
     return table.set_column(0, table.schema.field("t_ns"), pa.array(T0 + arrival_ns)), (taken_ns * 1.00004).astype(int)
 
 
-def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Recording) -> None:
+def test_the_jitter_of_arrival_is_taken_away_with_and_without_a_fit_of_the_device_s_clock(shard: Recording) -> None:
     table, device_ns = late()
     streams = {"xela1": with_device(table, device_ns), "robot": robot(np.arange(0, 9000))}
     errors = {}
@@ -226,7 +226,7 @@ def test_the_device_s_clock_takes_the_jitter_of_arrival_away(shard: Recording) -
         assert set(synced.column("xela1_t_device_ns").to_pylist()) <= set(device_ns.tolist())
         assert set(synced.column("xela1_seq").to_pylist()) <= set(range(1000))
     assert errors["auto"].max() < 0.2
-    assert np.median(errors["arrival"]) > 2
+    assert np.median(errors["arrival"]) < 0.1  # estimated while samples come, which needs some seconds to settle
 
 
 def test_the_fit_of_each_clock_is_an_attribute(shard: Recording) -> None:
@@ -413,7 +413,7 @@ def test_rows_of_held_values_do_not_depend_on_what_comes_later(kind: str, seed: 
     uncut, part = (synchronize(hold_params, FakeRecording(tables)) for tables in (streams, cut))
     rows = part.streams[""].num_rows
     assert rows and part.streams[""].to_pydict() == uncut.streams[""].slice(0, rows).to_pydict()
-    last_ns = max(stream["t_ns"].to_numpy()[-1] for stream in cut.values())
+    last_ns = cut["xela1"]["t_ns"].to_numpy()[-1]
     assert uncut.streams[""]["t_ns"].to_numpy()[rows:].min(initial=2 * T0) > last_ns
     assert uncut.attributes["look_ahead_max_ms"] == 0.0
     levels = []

@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from tacpipe.formats.arrays import episodes, zarr
 from tacpipe.formats.arrays.episodes import Episode, StreamArrays
 from tacpipe.formats.arrays.tree import (
     MAX_TEXT,
+    ArrayDescription,
     StoredAttributes,
     StoredValue,
     Tree,
@@ -29,15 +30,16 @@ from tacpipe.formats.arrays.tree import (
     pixel_format,
     plain_attributes,
 )
-from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream
+from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.table import column_names
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
-from tacpipe.printable import plain
+from tacpipe.printable import listed, plain
 
 LOOK_ROWS = 3  # number of rows read by `ArrayContainer.look`
 BLOCK_BYTES = 1 << 25  # number of bytes read at once; larger chunks of a file are read completely
 OBJECT_BYTES = 200  # assumed size of a string in memory
+UNFILLED = "without a stamp"  # reason why rows are not used
 MASK = "mask"  # group with robomimic's lists of recordings
 MAX_DEPTH = 4  # maximum depth of JSON in attributes
 RowsOf = Callable[[Tree, Episode, StreamArrays], "pa.Table | Batched"]
@@ -147,12 +149,19 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
             parts_read.append(part)
     parts_and_times = [(part, episodes.time_of_part(tree, episode, part)) for part in parts_read]
     selected = [(part, time) for part, time in parts_and_times if sources is None or part.source in sources]
-    if sources is None and any(time.is_declared for _, time in selected):
+    problems = {
+        part.source: problem
+        for part, time in selected
+        if not time.is_declared and (problem := _stamp_problem(tree, episode, part, contents.unused_stamps))
+    }
+    if sources is None and (problems or any(time.is_declared for _, time in selected)):
         for part, time in selected:
             if not time.is_declared:
-                skipped[part.source] = "has no stamps and no rate; a layout that names it gives them"
+                problem = problems.get(part.source, "has no stamps and no rate")
+                skipped[part.source] = f"{problem}; a layout that names it and its rate reads it"
         selected = [(part, time) for part, time in selected if time.is_declared]
     names = _stream_names(parts_read)
+    notes = [f"{tree.path}: {note}" for note in _describe_lengths(episode, selected)]
     streams = [
         SourceStream(
             part.source,
@@ -160,10 +169,46 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
             time,
             rows(tree, episode, part),
             episodes.row_count(episode, part),
+            dropped={UNFILLED: _unfilled_rows(episode, part)} if _unfilled_rows(episode, part) else {},
         )
         for part, time in selected
     ]
-    return EpisodeContents(streams, attributes, skipped, tree.notes)
+    return EpisodeContents(streams, attributes, skipped, [*tree.notes, *notes])
+
+
+def _stamp_problem(tree: Tree, episode: Episode, part: StreamArrays, unused: Sequence[ArrayDescription]) -> str:
+    """Return why the stamps beside the arrays of a stream cannot be used, as a clause, or "" if there are none."""
+    if episodes.has_no_stamp(tree, episode, part):
+        return f"has stamps ({plain(part.clock)}) that were never written"
+    stamps = next((array for array in unused if array.group == part.arrays[0].group), None)
+    if stamps is None:
+        return ""
+    return f"has {episodes.row_count(episode, part):,} rows, and {plain(stamps.name)} {stamps.shape[0]:,}"
+
+
+def _unfilled_rows(episode: Episode, part: StreamArrays) -> int:
+    return episodes.row_count(episode, replace(part, filled=None)) - episodes.row_count(episode, part)
+
+
+def _describe_lengths(episode: Episode, parts: Sequence[tuple[StreamArrays, Time]]) -> Iterator[str]:
+    """Yield sentences about rows without stamps, and about streams of one rate that have different lengths."""
+    lengths: dict[object, dict[int, list[str]]] = {}  # sources by number of rows, by rate, or else by group
+    for part, time in parts:
+        rows, unfilled = episodes.row_count(episode, part), _unfilled_rows(episode, part)
+        if unfilled:
+            yield (
+                f"the last {unfilled:,} of {rows + unfilled:,} stamps of {plain(part.source)} ({plain(part.clock)}) were "
+                f"never written; these rows are left out."
+            )
+        if not time.column:
+            lengths.setdefault(time.rate_hz or part.arrays[0].group, {}).setdefault(rows, []).append(plain(part.source))
+    for rate, sources in lengths.items():
+        if len(sources) > 1:
+            counts = "; ".join(f"{listed(names, 3)} {rows:,} rows" for rows, names in sources.items())
+            yield (
+                f"streams without stamps have different lengths: {counts}. All are read from their first row"
+                f"{f', at {rate:g} Hz' if isinstance(rate, float) else ''}, so check that they start together."
+            )
 
 
 def _masks(tree: Tree, episode: Episode) -> dict[str, Attribute]:

@@ -6,7 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -184,6 +184,7 @@ class StreamArrays:
     arrays: Sequence[ArrayDescription]
     time: ArrayDescription | None
     frames: bool = False  # whether its only array contains images
+    filled: int | None = None  # number of rows up to the last stamp that was written; None for all rows
 
     @property
     def all_arrays(self) -> Sequence[ArrayDescription]:
@@ -206,6 +207,7 @@ class StreamParts:
     parts: Sequence[StreamArrays]
     scalars: Sequence[ArrayDescription] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
+    unused_stamps: Sequence[ArrayDescription] = ()  # arrays of stamps with another length than all arrays beside them
 
 
 def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
@@ -235,7 +237,37 @@ def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
                 (columns_of_group if _is_column(array, arrays, episode) else scalars).append(array)
         parts += _divide_by_length(columns_of_group, relative_group or ROOT, episode, parent_stamps)
         parent_stamps += filter(_is_time, columns_of_group)
-    return StreamParts(parts, scalars, skipped)
+    used = [array for part in parts for array in part.all_arrays]
+    unused = [array for array in parent_stamps if array not in used]
+    for array in unused:
+        skipped[episode.inside(array.path)] = f"has {array.shape[0]} stamps, and no array beside it has as many rows"
+    filled_parts = [replace(part, filled=_filled_rows(tree, episode, part)) for part in parts]
+    return StreamParts(filled_parts, scalars, skipped, unused)
+
+
+def has_no_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> bool:
+    """Return whether a stream has an array of timestamps, and it was never written."""
+    rows = row_count(episode, part)
+    if not part.clock or rows < 2:
+        return False
+    return not any(np.nan_to_num(_stamps(tree, episode, part, row, row + 1)).any() for row in (0, rows // 2, rows - 1))
+
+
+def _filled_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
+    """Return the number of rows up to the last stamp that was written.
+
+    Stamps after it are NaN, or one number that is smaller, such as the 0 of an array that was created with its full size.
+    """
+    rows = row_count(episode, part)
+    if not part.clock or rows < 2:
+        return rows
+    (first,), (last,) = (_stamps(tree, episode, part, row, row + 1) for row in (0, rows - 1))
+    if last > first:
+        return rows
+    stamps = _stamps(tree, episode, part, 0, rows)
+    filled_rows = np.flatnonzero(~(np.isnan(stamps) | (stamps == last)))
+    filled = int(filled_rows[-1]) + 1 if len(filled_rows) else rows
+    return filled if np.isnan(last) or stamps[filled - 1] > last else rows
 
 
 def _reason_left_out(array: ArrayDescription, episode: Episode) -> str:
@@ -336,7 +368,8 @@ def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
 def row_count(episode: Episode, part: StreamArrays) -> int:
     """Return the number of rows of a stream in a recording."""
     length = part.arrays[0].shape[0]
-    return max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
+    rows = max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
+    return rows if part.filled is None else part.filled
 
 
 def parent_groups(group: str) -> list[str]:
@@ -351,11 +384,15 @@ def parent_groups(group: str) -> list[str]:
 
 def _last_stamp(tree: Tree, episode: Episode, part: StreamArrays) -> float:
     """Return the absolute value of a stream's last stored timestamp, or 0 if there is none."""
-    array = part.time or part.arrays[0]
-    last = episode.start + row_count(episode, part)
-    last_row = np.asarray(tree.read(array, max(last - 1, 0), last))
-    values = (last_row if part.time is not None else last_row[part.clock]).reshape(-1)
+    rows = row_count(episode, part)
+    values = _stamps(tree, episode, part, max(rows - 1, 0), rows)
     return abs(float(values[0])) if len(values) and np.isfinite(values[0]) else 0.0
+
+
+def _stamps(tree: Tree, episode: Episode, part: StreamArrays, start: int, stop: int) -> AnyArray:
+    """Return the stored timestamps of the rows ``start`` to ``stop`` (exclusive) of a recording (row,)."""
+    values = np.asarray(tree.read(part.time or part.arrays[0], episode.start + start, episode.start + stop))
+    return (values if part.time is not None else values[part.clock]).reshape(-1)
 
 
 def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:

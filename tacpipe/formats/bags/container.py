@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ import pyarrow as pa
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.bags import mcap_file, ros, ros_files
+from tacpipe.formats.bags.headers import APART_NS, MIN_BLOCKS, USE_LOG
 from tacpipe.formats.bags.images import declare_images
 from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Record, TopicConnection
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
@@ -105,6 +107,7 @@ def _texts(values: Mapping[str, Attribute]) -> dict[str, str]:
     return {str(key): str(value) for key, value in values.items()}
 
 
+SPLIT_NS = 10**9  # maximum time between two files of one recording
 LOOK_MESSAGES = 20_000  # maximum number of messages read per file by `Bag.look`
 MAX_DESCRIPTION_BYTES = 1 << 22  # maximum size of metadata.yaml
 READERS = {".mcap": mcap_file.read_records, ".db3": ros_files.read_sqlite_records, ".bag": ros_files.read_bag_records}
@@ -141,6 +144,8 @@ class Bag:
             for number, file in enumerate(files):
                 reading.add_records(_read_records(file), number, max_messages)
         contents = reading.contents()
+        if max_messages is None and not self.path.is_dir():
+            notes += _describe_next_part(self.path, reading.last_ns)
         return EpisodeContents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
 
@@ -178,6 +183,24 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
         raise TacpipeError(f"{path}: {plain(unsupported[0])} is of the storage {storage}; mcap and sqlite3 are read.")
     compressed = str(description.get("compression_mode") or "").lower() == "message"
     return [_unpack_file(file, stack) for file in present_files], compressed, notes
+
+
+def _describe_next_part(path: Path, last_ns: int) -> list[str]:
+    """Return a note if the file with the next number begins where this one ends, at the log time ``last_ns``."""
+    name = re.fullmatch(r"(.*_)(\d+)([.].+)", path.name)
+    following = path.with_name(f"{name[1]}{int(name[2]) + 1}{name[3]}") if name else path
+    if name is None or not following.is_file():
+        return []
+    with contextlib.ExitStack() as stack, contextlib.suppress(TacpipeError):
+        records = _read_records(_unpack_file(following, stack))
+        start_ns = next((record.log_ns for record in records if isinstance(record, BagMessage)), 0)
+        if 0 <= start_ns - last_ns < SPLIT_NS:
+            join = "rosbags-convert" if _file_ending(path) == ".bag" else "ros2 bag reindex"
+            return [
+                f"The files {name[1]}*{name[3]} in {path.parent} continue one another and are read as separate "
+                f"recordings. If they are parts of one, join them with `{join}`, and ingest again."
+            ]
+    return []
 
 
 def _read_records(path: Path) -> Iterator[Record]:
@@ -262,6 +285,7 @@ class _BagReading:
     notes: list[str] = field(default_factory=list)
     spill: Spill = field(default_factory=Spill)  # decoded messages
     undescribed: int = 0  # number of messages in channels without a description
+    last_ns: int = 0  # last log time of a message
     # channel by file number and channel number
     _described: dict[tuple[int, int], TopicConnection] = field(default_factory=dict)
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # topic by file number and channel number
@@ -335,7 +359,7 @@ class _BagReading:
         if metadata.name == EXPORT_KEY:
             self.attributes |= exported_attributes(metadata.values)
             return
-        from tacpipe.formats.table.label_table import plain_value
+        from tacpipe.io.config_text import plain_value
 
         for name, value in metadata.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))
@@ -347,6 +371,7 @@ class _BagReading:
     def contents(self) -> EpisodeContents:
         """Return the streams, attributes, skipped topics and notes."""
         streams_with_origin: list[tuple[ExportedStream | None, SourceStream]] = []
+        delays_s: dict[str, float] = {}  # delay of the times behind the log times by source
         for topic, reading in list(self.topics.items()):
             if not reading.count:
                 continue
@@ -367,9 +392,14 @@ class _BagReading:
                 content = topic_stream.content
                 if exported is None:
                     content = declare_images(content, self.types[topic])
-                streams_with_origin.append((exported, SourceStream(source, name, topic_stream.time, content, rows)))
-                if topic_stream.note:
-                    self.notes.append(f"{plain(source)}: {topic_stream.note}; its log times are used.")
+                arrivals = LOG if HEADER in content.schema.names else ""  # topics without header stamps have one time
+                stream = SourceStream(source, name, topic_stream.time, content, rows, arrivals)
+                streams_with_origin.append((exported, stream))
+                if topic_stream.content.rows >= MIN_BLOCKS:
+                    delays_s[source] = topic_stream.delay_ns / 1e9
+                self.last_ns = max(self.last_ns, topic_stream.log_span_ns[1])
+                self.notes += [f"{plain(source)}: {note}." for note in topic_stream.notes]
+        self.notes += self._describe_delays(delays_s)
         if self.undescribed:
             self.notes.append(f"{self.path} has {self.undescribed:,} messages of channels that it does not describe.")
         if self.ended_early:
@@ -388,6 +418,17 @@ class _BagReading:
         names = container.identifiers([stream.name for stream in streams])
         streams = [replace(stream, name=names[stream.name]) for stream in streams]
         return EpisodeContents(streams, self.attributes, self.skipped, self.notes)
+
+    def _describe_delays(self, delays_s: Mapping[str, float]) -> list[str]:
+        """Return a note if header stamps of some streams are further behind the log times than those of others."""
+        if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= APART_NS / 1e9:
+            return []
+        ordered = sorted(delays_s, key=lambda source: -delays_s[source])
+        delays = listed([f"{plain(source)} {delays_s[source]:.3f} s" for source in ordered], 6)
+        return [
+            f"{self.path}: header stamps are behind the log times by different amounts: {delays}. If these are the clocks "
+            f"of two computers, {USE_LOG} of all streams, and offset_s in its place shifts one."
+        ]
 
 
 def _decompress_message(content: bytes) -> bytes:

@@ -8,24 +8,25 @@ from __future__ import annotations
 import base64
 import binascii
 import functools
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from tacpipe.arrays import Int64s
+from tacpipe.formats.bags.headers import HeaderStamps
 from tacpipe.formats.container import Batched, Time
 from tacpipe.io import spill
 from tacpipe.io.spill import Piece, Spill
 from tacpipe.plugins.stage import Values
-from tacpipe.printable import plain
+from tacpipe.printable import listed, plain
 
 LOG, HEADER, PUBLISH, FRAME = "t_log_ns", "t_header_ns", "t_publish_ns", "frame_id"
-# maximum difference between a header stamp and its log time if both use the same clock
-MAX_STAMP_OFFSET_NS = 60 * 10**9
 ABOUT_TIME = {"unit": "ns", "quantity": "time"}
 
 
@@ -36,29 +37,24 @@ class TopicStream:
     suffix: str
     content: Batched
     time: Time
-    note: str  # remark about the timestamps, empty if there is none
+    delay_ns: float = 0.0  # median delay of its times behind the log times
+    log_span_ns: tuple[int, int] = (0, 0)  # first and last log time
+    notes: Sequence[str] = ()  # clauses about the times
 
 
 class TopicRows:
     """Collects the rows of one stream in ``spill``, and the properties shared by all rows."""
 
-    def __init__(self, spill: Spill) -> None:
-        """Create an empty stream whose rows are stored in ``spill``."""
-        self._spill = spill
+    def __init__(self, spill: Spill, about: Mapping[str, Mapping[str, str]]) -> None:
+        """Create an empty stream whose rows are stored in ``spill``. ``about`` has the field metadata by column."""
+        self._spill, self._about = spill, about
         self._pieces: list[Piece] = []
         self._schema: pa.Schema = pa.schema([])
-        self._about: dict[str, Mapping[str, str]] = {}
         self._absent: set[str] = set()  # columns that are missing in some rows
-        self._headers_set = self._headers_unset = False
-        self._apart_ns = 0  # maximum difference between header stamp and log time
+        self._headers = HeaderStamps()
+        self.log_span_ns = (2**63, -(2**63))  # first and last log time
         self._published_apart = False  # True if a publish time differs from its log time
-        self._frames: set[str] = set()  # frame names, at most two
-
-    def describe(self, about: Mapping[str, Mapping[str, str]]) -> int:
-        """Add field metadata by column without replacing existing metadata. Returns the number of described columns."""
-        for name, values in about.items():
-            self._about.setdefault(name, values)
-        return len(self._about)
+        self.frames: set[str] = set()  # frame names, at most two
 
     def add(self, table: pa.Table) -> None:
         """Add rows to the spill."""
@@ -73,14 +69,11 @@ class TopicRows:
         orders = [LOG]
         if HEADER in names and not table.column(HEADER).null_count:
             orders.append(HEADER)
-            header_ns = table.column(HEADER).to_numpy()
-            self._headers_set |= bool(header_ns.any())
-            self._headers_unset |= not header_ns.all()
-            self._apart_ns = max(self._apart_ns, int(np.abs(header_ns - log_ns).max(initial=0)))
+            self._headers.add(table.column(HEADER).to_numpy(), log_ns)
+        self.log_span_ns = min(self.log_span_ns[0], int(log_ns.min())), max(self.log_span_ns[1], int(log_ns.max()))
         self._published_apart |= not table.column(PUBLISH).equals(table.column(LOG))
-        if len(self._frames) < 2:
-            frames = table.column(FRAME).unique().to_pylist() if FRAME in names else [""]
-            self._frames |= {frame or "" for frame in frames}
+        if len(self.frames) < 2:
+            self.frames |= set(_frames(table))
         self._pieces.append(self._spill.add(table, orders))
 
     def finish(self, suffix: str) -> TopicStream:
@@ -88,15 +81,18 @@ class TopicRows:
 
         Columns of constant or redundant times and frames are left out.
         """
-        clock, note = self._choose_clock()
+        has_headers = HEADER in self._schema.names and HEADER not in self._absent
+        counts, problem = self._headers.counts, self._headers.problem() if has_headers else ""
+        clock = HEADER if has_headers and not problem else LOG
         left_out = set() if self._published_apart else {PUBLISH}
-        if clock == LOG and HEADER not in self._absent and not self._headers_set:
+        if has_headers and counts["unset"] == counts["rows"]:
             left_out.add(HEADER)
+        notes = [f"{problem}; its log times are used"] if problem and HEADER not in left_out else []
         metadata = {name: dict(values) for name, values in self._about.items()}
         metadata |= {name: dict(ABOUT_TIME) for name in (LOG, PUBLISH, HEADER)}
         metadata[clock]["clock"] = "header stamp" if clock == HEADER else "log time"
-        if FRAME in self._schema.names and len(self._frames) == 1:
-            (frame,) = self._frames
+        if FRAME in self._schema.names and len(self.frames) == 1:
+            (frame,) = self.frames
             if frame:
                 metadata[clock]["frame"] = plain(frame)
             left_out.add(FRAME)
@@ -107,26 +103,67 @@ class TopicRows:
 
         def read(piece: Piece) -> pa.Table:
             table = self._spill.read(piece)
+            if clock == HEADER:
+                times = pc.min_element_wise(table.column(HEADER), table.column(LOG))
+                table = table.set_column(table.column_names.index(HEADER), HEADER, times)
             return pa.table([_fill_nulls(table, field) for field in schema], schema)
 
-        count = sum(piece.rows for piece in self._pieces)
-        content = Batched(schema, count, lambda: spill.in_order(self._pieces, read, clock))
-        return TopicStream(suffix, content, Time(clock, "ns"), note)
+        pieces = self._pieces
+        if clock == HEADER:
+            pieces = [replace(piece, minima={HEADER: min(piece.minima.values())}) for piece in pieces]
+            notes += self._headers.notes()
+        content = Batched(schema, sum(piece.rows for piece in pieces), lambda: spill.in_order(pieces, read, clock))
+        delay_ns = self._headers.delay_ns if clock == HEADER else 0.0
+        return TopicStream(suffix, content, Time(clock, "ns"), delay_ns, self.log_span_ns, notes)
 
-    def _choose_clock(self) -> tuple[str, str]:
-        """Return the name of the time column, and the reason if header stamps exist and are not used, or "".
+    def take(self, source: TopicRows) -> None:
+        """Add the rows of another collection in the same spill."""
+        for piece in source._pieces:
+            self.add(self._spill.read(piece))
 
-        A header stamp is the time of measurement; the log time is the time of arrival. Header stamps are used only if
-        all are set and they share the log's clock. Stamps of a simulation, of a device clock, or of a clock that was
-        set during the recording would separate streams.
-        """
-        if HEADER not in self._schema.names or HEADER in self._absent:
-            return LOG, ""
-        if self._headers_unset:
-            return LOG, "some header stamps are not set" if self._headers_set else ""
-        if self._apart_ns > MAX_STAMP_OFFSET_NS:
-            return LOG, f"header stamps are up to {self._apart_ns / 1e9:.3g} s from the log times"
-        return HEADER, ""
+
+def _frames(table: pa.Table) -> list[str]:
+    """Return the names of the frames in a table; messages without a frame have the name ""."""
+    frames = table.column(FRAME).unique().to_pylist() if FRAME in table.column_names else [""]
+    return list(dict.fromkeys(frame or "" for frame in frames))
+
+
+def _split_by_frame(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
+    """Yield the rows of each frame; all rows, under the name of the first, if there are more than `MAX_SENSORS`."""
+    frames = _frames(table)
+    if not 1 < len(frames) <= MAX_SENSORS:
+        yield frames[0], table
+        return
+    for frame in frames:
+        part = table.filter(pc.equal(table.column(FRAME).fill_null(""), frame))
+        yield frame, part.select([name for name in part.column_names if part.column(name).null_count < part.num_rows])
+
+
+def _finish_frames(suffix: str, rows_by_frame: Mapping[str, TopicRows]) -> list[TopicStream]:
+    """Return a stream for each frame if the frames are those of several sensors, otherwise one stream.
+
+    Messages of several sensors alternate. A frame that follows another one is a change of a setting, and many frames
+    are numbers or names of objects.
+    """
+    first, *remaining = rows_by_frame.values()
+    spans_ns = sorted(rows.log_span_ns for rows in rows_by_frame.values())
+    alternate = all(start < stop for (_, stop), (start, _) in itertools.pairwise(spans_ns))
+    if (
+        len(rows_by_frame) <= MAX_SENSORS
+        and alternate
+        and all(len(rows.frames) == 1 for rows in rows_by_frame.values())
+    ):
+        streams = [
+            rows.finish(":".join(filter(None, [suffix, frame if remaining else ""])))
+            for frame, rows in rows_by_frame.items()
+        ]
+        note = (
+            f"has messages of {len(streams)} sensors, the frames {listed(rows_by_frame, MAX_SENSORS)}: each is a stream"
+        )
+        return [replace(streams[0], notes=[note, *streams[0].notes]), *streams[1:]] if remaining else streams
+    for rows in remaining:
+        first.take(rows)
+    return [first.finish(suffix)]
 
 
 def _column_type(kind: pa.DataType, absent: bool) -> pa.DataType:
@@ -155,6 +192,7 @@ def _fill_nulls(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
 BATCH_BYTES = 1 << 24  # size of undecoded messages per topic in memory
 BATCH_MESSAGES = 1 << 16
 MAX_STREAM_COLUMNS = 1 << 14
+MAX_SENSORS = 16  # maximum number of frames on one topic that are read as one stream each
 
 
 class TopicError(ValueError):
@@ -187,7 +225,8 @@ class TopicDecoder:
         self._log_ns: list[int] = []
         self._publish_ns: list[int] = []
         self._bytes = 0
-        self._streams: dict[str, TopicRows] = {}  # rows by stream suffix
+        self._streams: dict[str, dict[str, TopicRows]] = {}  # rows by stream suffix and frame
+        self._about: dict[str, dict[str, Mapping[str, str]]] = {}  # field metadata by stream suffix and column
         self.count = 0
 
     def add(self, message: bytes, log_ns: int, publish_ns: int) -> None:
@@ -203,7 +242,11 @@ class TopicDecoder:
     def finish(self) -> list[TopicStream]:
         """Return the streams of the topic. Raises `TopicError` if they cannot be decoded."""
         self._flush()
-        return [rows.finish(suffix) for suffix, rows in self._streams.items()]
+        return [
+            stream
+            for suffix, rows_by_frame in self._streams.items()
+            for stream in _finish_frames(suffix, rows_by_frame)
+        ]
 
     def _flush(self) -> None:
         """Decode the messages in memory and add their rows to the streams.
@@ -218,19 +261,22 @@ class TopicDecoder:
             blocks.setdefault(block.suffix, []).append(block)
         self._messages, self._log_ns, self._publish_ns, self._bytes = [], [], [], 0
         for suffix, suffix_blocks in blocks.items():
-            stream = self._streams.setdefault(suffix, TopicRows(self._spill))
+            rows_by_frame = self._streams.setdefault(suffix, {})
+            about = self._about.setdefault(suffix, {})
             tables = []
             for block in suffix_blocks:
                 stamps = {LOG: pa.array(log_ns[block.rows]), PUBLISH: pa.array(publish_ns[block.rows])}
                 tables.append(pa.table({**stamps, **block.columns}))
-                if stream.describe(block.about) > MAX_STREAM_COLUMNS:
+                about |= {name: values for name, values in block.about.items() if name not in about}
+                if len(about) > MAX_STREAM_COLUMNS:
                     raise TopicError(f"its messages have more than {MAX_STREAM_COLUMNS} values")
             table = pa.concat_tables(tables, promote_options="permissive")
             rows = np.concatenate([block.rows for block in suffix_blocks])
             if (np.diff(rows) < 0).any():
                 table = table.combine_chunks().take(pa.array(np.argsort(rows, kind="stable")))
             try:
-                stream.add(table)
+                for frame, part in _split_by_frame(table):
+                    rows_by_frame.setdefault(frame, TopicRows(self._spill, about)).add(part)
             except pa.ArrowException as error:
                 raise TopicError("its messages hold values of different types in one place") from error
 

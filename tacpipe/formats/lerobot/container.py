@@ -41,6 +41,7 @@ COUNTING_FEATURES = (INDEX, FRAME, STAMP, "index", "task_index")  # features tha
 SHARED_STREAMS = ("next", NATIVE)  # features with these prefixes form one stream, such as next.reward and next.done
 EXACT = f"{NATIVE}.t_ns"  # feature with the timestamps in ns of datasets exported by tacpipe
 CLOCK = Time(column="t_ns", unit="ns", origin="start")
+WRITE_AGAIN = "Write the episode again, or leave it out with --skip-bad."
 FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
 
 
@@ -145,8 +146,9 @@ class LeRobotContainer:
             if not file_system.present(regular.inside(self.path, path))
         }
         attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
-        streams = self._streams(episode, sources, rows=rows)
-        return EpisodeContents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
+        streams, time_notes = self._streams(episode, sources, rows=rows)
+        notes = [*self._notes(episode), *time_notes]
+        return EpisodeContents(streams, attributes | {"fps": self._about.fps}, skipped, notes)
 
     def _exported_stream(self, name: str, path: Path) -> SourceStream:
         """Return a stream bit for bit as before the export. Rows of a long stream are decoded when they are read."""
@@ -163,8 +165,8 @@ class LeRobotContainer:
 
     def _streams(
         self, episode: EpisodeDescription, sources: Collection[str] | None, *, rows: bool
-    ) -> list[SourceStream]:
-        """Return the streams of an episode: one per feature or group of features, and one per video.
+    ) -> tuple[list[SourceStream], list[str]]:
+        """Return the streams of an episode: one per feature or group of features, and one per video. Adds notes on time.
 
         The tables are empty if ``rows`` is False.
         """
@@ -185,10 +187,11 @@ class LeRobotContainer:
             episode, [*exact_keys, *(feature.key for features in selected.values() for feature in features)]
         )
         if exact_keys:
-            t_ns, time_metadata = frames.column(EXACT).to_numpy(), {}
+            t_ns, time_metadata, notes = frames.column(EXACT).to_numpy(), {}, list[str]()
         else:
             t_ns, stamp_source = _frame_stamps(frames, self._about.fps, self.path / episode.file)
             time_metadata = {"made": stamp_source}
+            notes = [self._describe_rate(t_ns)] if stamp_source == FROM_STAMPS else []
         clock = pa.field(CLOCK.column, pa.int64(), metadata=time_metadata)
         frames = frames if rows else frames.slice(0, 0)
         streams = [self._video_stream(episode, key, names[_stream_stem(key)], t_ns, clock) for key in videos]
@@ -200,7 +203,16 @@ class LeRobotContainer:
             table = pa.table([values for _, values in columns], pa.schema([field for field, _ in columns]))
             time = replace(CLOCK, origin="unix") if exact_keys else CLOCK
             streams.append(SourceStream(source, names[_stream_stem(source)], time, table, episode.length))
-        return streams
+        return streams, notes
+
+    def _describe_rate(self, t_ns: Int64s) -> str:
+        """Return a sentence about timestamps (time,) that do not agree with the declared rate."""
+        step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+        rate = f" of about {1e9 / step_ns:.3g} Hz" if step_ns > 0 else ""
+        return (
+            f"{self.path}: {description.INFO} states {self._about.fps:g} fps, and {STAMP} has other times{rate}. t_ns has "
+            f"those of {STAMP}. For times at a rate, write time = {{ rate_hz = … }} in a layout."
+        )
 
     def _video_stream(
         self, episode: EpisodeDescription, key: str, name: str, t_ns: Int64s, clock: pa.Field
@@ -255,6 +267,8 @@ class LeRobotContainer:
             frames = file.read_row_groups([], columns=columns, use_threads=False)
             for group in groups:  # filtering each row group bounds the memory
                 rows = file.read_row_group(group, columns=columns, use_threads=False)
+                if nulls := rows.column(INDEX).null_count:
+                    raise TacpipeError(f"{path}: {INDEX} of {nulls} rows is null. {WRITE_AGAIN}")
                 frames = pa.concat_tables([frames, rows.filter(pc.equal(rows.column(INDEX), episode.index))])
         if frames.num_rows != episode.length:
             raise TacpipeError(
@@ -299,7 +313,6 @@ class LeRobotContainer:
 
         Raises `TacpipeError` if a row does not have as many values as the feature declares.
         """
-        kind = values.type
         inner = values.combine_chunks()
         while (
             pa.types.is_list(inner.type)
@@ -307,14 +320,14 @@ class LeRobotContainer:
             or pa.types.is_large_list(inner.type)
         ):
             inner = inner.flatten()
-        if not pa.types.is_nested(kind):
+        is_text = pa.types.is_string(inner.type)
+        if not pa.types.is_nested(values.type):
+            if inner.null_count and not is_text:
+                raise _values_error(self.path / episode.file, feature.key, values, 1)
             return [pa.array(inner)]
         if len(inner) != len(values) * feature.width or inner.null_count:
-            raise TacpipeError(
-                f"{self.path / episode.file}: {plain(feature.key)} holds rows of another length than the {feature.width} "
-                f"values that {description.INFO} states."
-            )
-        if pa.types.is_string(inner.type):
+            raise _values_error(self.path / episode.file, feature.key, values, feature.width)
+        if is_text:
             return [
                 inner.take(pa.array(np.arange(position, len(inner), feature.width)))
                 for position in range(feature.width)
@@ -364,16 +377,46 @@ def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
     ]
 
 
+def _values_error(path: Path, key: str, values: pa.ChunkedArray, width: int) -> TacpipeError:
+    """Return the error for the first frame (counted from 0) with a null or another number of values than ``width``."""
+    for frame, entry in enumerate(values.to_pylist()):
+        leaves = list(_leaves(entry))
+        if None in leaves:
+            place = f", value {leaves.index(None)}," if isinstance(entry, list) else ""
+            return TacpipeError(f"{path}: frame {frame}{place} of {plain(key)} is null (counted from 0). {WRITE_AGAIN}")
+        if len(leaves) != width:
+            break
+    return TacpipeError(
+        f"{path}: frame {frame} of {plain(key)} (counted from 0) has {len(leaves)} values, and {description.INFO} states "
+        f"{width}. {WRITE_AGAIN}"
+    )
+
+
+def _leaves(value: object) -> Iterator[object]:
+    """Yield the values in nested lists."""
+    if isinstance(value, list):
+        for inner in value:
+            yield from _leaves(inner)
+    else:
+        yield value
+
+
 def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
     """Return timestamps (time,) in ns since the start of the episode, and how they were made.
 
-    They are computed from the rate if the stored times agree with it. Raises `TacpipeError` if a time is not finite.
+    They are computed from the rate if the stored times agree with it. Raises `TacpipeError` if a time is null or not
+    finite.
     """
+    for key in (FRAME, STAMP):
+        if frames.column(key).null_count:
+            raise _values_error(path, key, frames.column(key), 1)
     index = frames.column(FRAME).to_numpy().astype(np.int64)  # (time,)
     seconds = frames.column(STAMP).to_numpy().astype(np.float64)
     if not np.isfinite(seconds).all():
         row = int((~np.isfinite(seconds)).argmax())
-        raise TacpipeError(f"{path}: {STAMP} of frame {row + 1} is {seconds[row]}; it must be a number of seconds.")
+        raise TacpipeError(
+            f"{path}: {STAMP} of frame {row} (counted from 0) is {seconds[row]}; it must be a number of seconds."
+        )
     allowed_s = TOLERANCE_S + np.spacing(np.abs(seconds).astype(np.float32))  # adds the rounding of float32
     if (np.abs(index / fps - seconds) <= allowed_s).all():
         return _exact_stamps(index, fps), FROM_RATE

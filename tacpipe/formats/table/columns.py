@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError
@@ -17,6 +20,7 @@ from tacpipe.formats.table.layout import ColumnRule, StreamLayout
 from tacpipe.printable import listed, plain
 
 TIME = "t_ns"
+MAX_EXACT = 2**53  # number up to which float64 holds all whole numbers
 TYPES = {
     **{
         name: getattr(pa, name)() for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
@@ -56,13 +60,17 @@ class CellError(ValueError):
 
 
 def choose_columns(
-    stream: StreamLayout, names: Sequence[str], path: Path, declared: Declared = NO_DECLARATION
+    stream: StreamLayout,
+    names: Sequence[str],
+    path: Path,
+    declared: Declared = NO_DECLARATION,
+    notes: list[str] | None = None,
 ) -> list[ChosenColumn]:
-    """Return the columns to read among those in ``path``, in the file's order.
+    """Return the columns to read among those in ``path``, in one order for all files: by rule, then by placeholders.
 
     ``declared`` are the fields that the file describes. They apply to columns without a matching rule; a rule replaces
-    only the properties that it sets. Raises `TacpipeError` for a column without a description, a rule without a match,
-    and duplicate names.
+    only the properties that it sets. A name without a column becomes a note, because some recordings of a lab may lack a
+    column. Raises `TacpipeError` for a column without a description, another rule without a match, and duplicate names.
     """
     chosen_columns: list[ChosenColumn] = []
     used = set()
@@ -80,8 +88,13 @@ def choose_columns(
         if not rule.skip:
             chosen_columns.append(ChosenColumn(name, _column_field(rule, name, values, declared.get(name)), rule))
     chosen_columns = _place_cells(chosen_columns, path, stream)
+    if not declared:
+        chosen_columns = _in_one_order(chosen_columns, stream)
     unused = [rule.match for rule in stream.columns if rule not in used]
-    if unused:
+    are_names = not any(set("{*") & set(match) for match in unused)
+    if unused and are_names and chosen_columns and not declared and notes is not None:
+        notes.append(f"{stream.name} has no column {listed(unused, 3)}.")
+    elif unused:
         raise TacpipeError(
             f"{path} has no column that matches {listed(unused, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
         )
@@ -95,6 +108,22 @@ def choose_columns(
     if not chosen_columns:
         raise TacpipeError(f"{path}: [streams.{stream.name}] skips all columns. Name one that is to be read.")
     return chosen_columns
+
+
+def _in_one_order(chosen_columns: Sequence[ChosenColumn], stream: StreamLayout) -> list[ChosenColumn]:
+    """Return columns in the order of the rules, and those of a rule by its placeholders, numbers by value and w after z.
+
+    Cells of an array stay as they are.
+    """
+    ranks = {rule: rank for rank, rule in reversed([*enumerate(stream.columns)])}
+
+    def key(column: ChosenColumn) -> tuple[Any, ...]:
+        texts = tuple((pattern.match(column.rule.match, column.name) or {}).values()) or (column.name,)
+        parts = [part for text in texts for part in re.findall(r"\d+|\D+", text.lower())]
+        order = [(int(part), "") if part.isdecimal() else (-1, "~" if part == "w" else part) for part in parts]
+        return ranks[column.rule], () if column.rule.shape else tuple(order)
+
+    return sorted(chosen_columns, key=key)
 
 
 def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: StreamLayout) -> list[ChosenColumn]:
@@ -193,6 +222,13 @@ def convert_column(
         except pa.ArrowInvalid:
             row = next(row for row, value in enumerate(array) if not _fits(value, kind))
             raise CellError(row, f"holds {array[row].as_py()}, which is not {kind}") from None
+    if pa.types.is_integer(array.type):
+        integers = array.fill_null(0).to_numpy(zero_copy_only=False)
+        large = (integers > MAX_EXACT) | (integers < -MAX_EXACT)
+        if large.any():
+            row = int(large.argmax())
+            remedy = f'Set type = "{array.type}" for this column'
+            raise CellError(row, f"holds {array[row].as_py()}, beyond the whole numbers that a float holds. {remedy}")
     values = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
     missing = array.is_null().to_numpy(zero_copy_only=False)
     bad = (np.isinf(values) & (not inf_allowed)) | (np.isnan(values) & ~missing & (not nan_allowed))
@@ -202,6 +238,15 @@ def convert_column(
     scaled = values if target.rule.scale == 1.0 else values * target.rule.scale
     with np.errstate(over="ignore"):
         return pa.array(scaled.astype(kind.to_pandas_dtype()))
+
+
+def exceeds_floats(column: pa.Array, target: ChosenColumn) -> bool:
+    """Return whether a converted column has whole numbers that were rounded, because the layout does not state a type."""
+    if target.rule.type is not None or target.rule.scale != 1.0 or not pa.types.is_float64(column.type):
+        return False
+    limits = pc.min_max(column)
+    most = max(abs(limits[side].as_py() or 0.0) for side in ("min", "max"))
+    return bool(MAX_EXACT < most < 2.0**64)
 
 
 def _is_finite(column: pa.ChunkedArray) -> bool:

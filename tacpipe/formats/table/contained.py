@@ -224,7 +224,7 @@ def read_recording(
     else:
         recorded_streams = recordings.read_container(str(kind), paths[CONTAINER], values.get(EPISODE))
     return RecordingOutput(
-        recorded_streams.streams, {**recorded_streams.attributes, **values[LABELS]}, recorded_streams.notes
+        recorded_streams.streams, {**recorded_streams.attributes, **values[LABELS]}, recorded_streams.notes, rows={}
     )
 
 

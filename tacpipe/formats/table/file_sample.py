@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import datetime
+import itertools
 import json
 import re
 from collections import Counter
@@ -19,7 +20,7 @@ import pyarrow as pa
 from tacpipe.channels import schema
 from tacpipe.formats.table import binary, column_names, label_table, stamps, text
 from tacpipe.formats.table.binary import ArrayMember
-from tacpipe.formats.table.columns import TYPES
+from tacpipe.formats.table.columns import MAX_EXACT, TYPES
 from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, StreamLayout, extension, quoted
 from tacpipe.formats.table.text import Workbook
 
@@ -28,7 +29,7 @@ HEAD_BYTES = 1 << 20  # maximum number of bytes sampled per file
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-_WHOLE = re.compile(r"[-+]?\d{1,18}")
+_WHOLE = re.compile(r"[-+]?\d{1,20}")
 _COMMA_NUMBER = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 MISSING = ("", "NA", "N/A", "nan", "NaN", "null", "None", "-")
 
@@ -252,6 +253,7 @@ def _parse_cell(cell: str, text: Dialect) -> float | str | None:
     return number if number is not None else (None if cell in MISSING else cell)
 
 
+_LARGE_INTEGERS = (("int64", -(2**63), 2**63 - 1), ("uint64", 0, 2**64 - 1))
 _INTEGERS = (("uint16", 0, 2**16 - 1), ("int16", -(2**15), 2**15 - 1), ("int32", -(2**31), 2**31 - 1))
 
 
@@ -339,8 +341,10 @@ def _kind(values: Sequence[float | str]) -> str:
     ):  # also for values such as 2.0, because a later cell may be 2.5
         return "float64"
     numbers = [int(value) for value in values]
+    exceeds_floats = max(abs(min(numbers)), max(numbers)) > MAX_EXACT
+    kinds = _INTEGERS if not exceeds_floats else _LARGE_INTEGERS
     return next(
-        (kind for kind, lowest, highest in _INTEGERS if lowest <= min(numbers) and max(numbers) <= highest), "float64"
+        (kind for kind, lowest, highest in kinds if lowest <= min(numbers) and max(numbers) <= highest), "float64"
     )
 
 
@@ -376,7 +380,7 @@ def increases(values: Sequence[float | str | None]) -> bool:
     numbers = [value for value in values if isinstance(value, int | float)]
     return (
         len(numbers) == len(values) > 1
-        and bool(np.all(np.diff(np.array(numbers, float)) >= 0))
+        and all(before <= after for before, after in itertools.pairwise(numbers))
         and numbers[-1] > numbers[0]
     )
 
@@ -394,12 +398,13 @@ def time_entry(sample: FileSample, column: str | None, file: str = "") -> str:
         return f'{{ {source}, unit = "iso8601" }}'
     if texts:
         return _text_stamp_entry(texts, source)
-    first = next((abs(value) for value in values if isinstance(value, int | float)), 0.0)
-    for limit, unit in ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns")):
-        if 1e8 <= first < limit:
-            return f'{{ {source}, unit = "{unit}" }}'
+    usual = float(np.median([abs(value) for value in values if isinstance(value, int | float)] or [0.0]))
     suffix = re.search(r"(?:^|[_ ])(ms|us|ns|s|sec|seconds)$", column_names.without_unit(column), re.IGNORECASE)
     unit_text = sample.stated_unit(column) or schema.unit_from_text(suffix[1] if suffix else "")
+    stated_s = usual * 10.0 ** (stamps.DIGITS.get(unit_text, 9) - 9)
+    for limit, unit in ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns")):
+        if 1e8 <= usual < limit and (stated_s >= 1e8 or unit_text not in stamps.DIGITS):
+            return f'{{ {source}, unit = "{unit}" }}'
     steps = np.diff([value for value in values if isinstance(value, float)])
     if not unit_text and len(steps) and 0 < float(np.median(steps)) < 0.5:
         unit_text = "s"  # in ms, steps this small would mean thousands of rows per second

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import itertools
 import re
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
 from tacpipe.formats import container
-from tacpipe.formats.table import column_names, file_sample, pattern, reading
+from tacpipe.formats.table import column_names, file_sample, pattern, reading, repairs, rows
+from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
 from tacpipe.formats.table.label_table import RECORDING, read_label_table
 from tacpipe.formats.table.layout import (
@@ -27,6 +30,7 @@ from tacpipe.formats.table.layout import (
     quoted,
     why_unreadable,
 )
+from tacpipe.io import config_text
 from tacpipe.io import files as file_system
 from tacpipe.printable import shown
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS, scan, scan_images
@@ -77,7 +81,7 @@ def guess_layout(folder: Path) -> str:
             path, "it is no stream, and no file of labels that each recording has"
         )
 
-    sections = [_stream_text(group) for group in groups]
+    sections = [_with_repairs(_stream_text(group), group, folder) for group in groups]
     sections += [_labels_text(group) for group in labels]
     sections += [f"[[labels]]\nfile = {quoted(text)}" for text in trees]
     sections.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
@@ -110,6 +114,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         if sample.text is not None and not (sample.text.header or sample.text.rows):
             damaged |= {path.as_posix(): "it has no row" for path in paths}
             continue
+        sample = _with_columns_of(sample, [folder / path for path in paths[1:]])
         is_shared_table = len(paths) == 1 < len(data) and _is_labels(sample)
         group = _FileGroup(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
         has_one_row_per_file = (
@@ -120,6 +125,19 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         else:
             streams += _group_by_length(group)
     return streams, labels, damaged
+
+
+def _with_columns_of(sample: FileSample, paths: Sequence[Path]) -> FileSample:
+    """Return the sample of a text file with the columns that only other files of the stream have."""
+    for path in paths if sample.text is not None and sample.text.header else ():
+        try:
+            other = file_sample.read_sample(path)
+        except TacpipeError:
+            continue
+        names = [name for name in other.names if name not in sample.values] if other.text and other.text.header else []
+        values = {name: other.values[name] for name in names}
+        sample = replace(sample, names=(*sample.names, *names), values={**sample.values, **values})
+    return sample
 
 
 def _camera_groups(
@@ -351,6 +369,39 @@ def _stream_text(group: _FileGroup) -> str:
     rules += [f"{{ match = {quoted(f'{name}*')}, skip = true }}," for name in group.skipped]
     lines += ["columns = [", *(f"    {rule}" for rule in rules), "]"]
     return "\n".join(lines)
+
+
+def _with_repairs(text: str, group: _FileGroup, folder: Path) -> str:
+    """Return the text of a stream with the entries of its time that the stamps of all files need."""
+    tables = tomllib.loads(text)["streams"][group.stream]
+    if group.camera or "recording" in tables or not {"column", "file"} & set(tables["time"]):
+        return text
+    time = {name: value for name, value in tables["time"].items() if value != UNKNOWN}
+    values = {**tables, "time": time, "columns": [{"match": "*"}]}
+    (stream,) = layouts.layout_from_tables({"streams": {group.stream: values}}).streams
+    changes: dict[str, Any] = {}
+    first_rows = []
+    for path in group.paths:
+        placeholders = pattern.match(group.pattern, path.as_posix()) or {}
+        stamps = folder / pattern.fill_pattern(group.stamps, placeholders) if group.stamps else None
+        for _ in layouts.REPAIRS:
+            repaired = replace(stream, time=replace(stream.time, **{k: v for k, v in changes.items() if v != UNKNOWN}))
+            try:
+                first_rows.append(
+                    reading.check_stamps(rows.open_rows(folder / path, repaired), repaired, stamps).drop_first
+                )
+            except repairs.ClockError as error:
+                if error.changes.items() <= changes.items():
+                    break
+                changes |= error.changes
+                continue
+            except TacpipeError:
+                pass  # reading the file reports the error
+            break
+    if first_rows and all(first_rows):
+        changes["drop_first"] = max(first_rows)
+    added = "".join(f", {name} = {config_text.toml_value(value)}" for name, value in changes.items())
+    return re.sub(r"^(time = \{.*?)( \})", lambda entry: entry[1] + added + entry[2], text, count=1, flags=re.MULTILINE)
 
 
 def _text_entries(sample: FileSample, path: Path) -> list[str]:

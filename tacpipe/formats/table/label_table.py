@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import datetime
 import io
-import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,34 +16,11 @@ from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats import container
 from tacpipe.formats.table.layout import TREES
 from tacpipe.io import config_text, regular
+from tacpipe.io.config_text import plain_value
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
 MAX_LABEL_BYTES = 1 << 26  # maximum size of a label file
-
-
-def plain_value(text: str) -> Attribute:
-    """Return the value of a cell's text: true, false, a number if it is written as one, else the text.
-
-    A number with leading zeros is text, because it is usually a name.
-
-    >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
-    [3, 0.5, '007', True, 'cork', None, 'nan']
-    """
-    stripped = text.strip()
-    if stripped.lower() in ("true", "false"):
-        return stripped.lower() == "true"
-    if not stripped:
-        return None
-    digits = stripped.lstrip("-")
-    if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
-        return int(stripped) if len(digits) < 19 else stripped
-    try:
-        number = float(stripped)
-    except ValueError:
-        return stripped
-    is_number = math.isfinite(number) and not digits.startswith("00") and "_" not in stripped and not digits.isdigit()
-    return number if is_number else stripped
 
 
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -242,7 +218,7 @@ def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     """
     text = read_text(path)
     try:
-        tree = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
+        tree = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_labels(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     entries: list[tuple[str, Any]] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.table import label_table, pattern
-from tacpipe.formats.table.label_table import plain_value, read_rows, read_text
+from tacpipe.formats.table.label_table import read_rows, read_text
 from tacpipe.formats.table.layout import TREES, LabelSource, Layout
-from tacpipe.formats.table.recordings import RecordingFiles
+from tacpipe.formats.table.recordings import RecordingFiles, joined_values
 from tacpipe.io import config_text
+from tacpipe.io.config_text import plain_value
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
@@ -91,7 +93,7 @@ def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
     """Return other names that a table may use for a recording: those of folders and files that contain its placeholders.
 
     With the pattern ``run_{trial}/skin.csv``, the recording of ``run_07/skin.csv``, whose trial is 07, is also called
-    run_07.
+    run_07, and trial-07.
     """
     segments = {segment for stream in layout.streams for segment in stream.files.split("/")}
     alternatives = []
@@ -99,7 +101,7 @@ def _alternative_names(layout: Layout, source: RecordingFiles) -> list[str]:
         names = pattern.placeholders(segment)
         if names and "*" not in segment and set(names) <= set(source.values):
             alternatives.append(pattern.fill_pattern(segment, source.values).partition(".")[0])
-    return sorted(alternatives)
+    return [*sorted(alternatives), joined_values(source.values)]
 
 
 def _find_row(
@@ -124,7 +126,7 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
         return _read_single_row(path)
     text = read_text(path)
     try:
-        values = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_yaml(text)
+        values = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_labels(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     if not isinstance(values, dict):
@@ -144,9 +146,12 @@ def _label_value(value: Any, name: Any, path: Path) -> Attribute:
     """Return a label's value; dates become text. Raises `TacpipeError` if it is not plain."""
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
-    if value is None or isinstance(value, str | int | float | bool):
+    is_finite = not isinstance(value, float) or math.isfinite(value)
+    if is_finite and (value is None or isinstance(value, str | int | float | bool)):
         return value
-    raise TacpipeError(f"{path}: {plain(str(name))} is {excerpt(value)}; a label is text, a number, or true or false.")
+    raise TacpipeError(
+        f"{path}: {plain(str(name))} is {excerpt(value)}; a label is text, a finite number, or true or false."
+    )
 
 
 def _select_columns(values: dict[str, Attribute], labels: LabelSource, recording: str) -> dict[str, Attribute]:

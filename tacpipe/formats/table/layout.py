@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import json
 import tomllib
+import zoneinfo
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +79,7 @@ UNKNOWN = "?"  # marks an entry of a guessed layout that a person must fill in
 MAX_NAMED = 4  # maximum number of unknown entries named in an error
 
 
+REPAIRS = ("batch", "wrap", "offset_s", "sort", "split_at_reset", "drop_first", "ambiguous")  # entries of ``time``
 DECLARED = Time()  # no column or rate: the container declares the time
 
 
@@ -349,6 +351,7 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
             f"{stream_place}: separator and decimal are both {stream.decimal!r}; a number could not be read."
         )
     _expect_encoding(stream, stream_place)
+    _expect_repairs(stream, stream_place)
     absent = set(pattern.placeholders(stream.time.file)) - set(pattern.placeholders(stream.files))
     if absent:
         raise UsageError(f"{stream_place}: time.file names {{{min(absent)}}}, which files does not have.")
@@ -449,8 +452,15 @@ def _parse_time(table: Any, stream_place: str) -> Time:
     """
     place = f"{stream_place}, time"
     time: Time = fields.build_dataclass(Time, _expect_table(table, stream_place, "time"), place, "entry")
-    if bool(time.column or time.file) == (time.rate_hz is not None):
-        raise UsageError(f"{place}: give either the column or the file with the stamps, or rate_hz.")
+    if not time.is_declared:
+        raise UsageError(f"{place}: give the column or the file with the stamps, or rate_hz.")
+    repairs = [name for name in REPAIRS if getattr(time, name)]
+    if repairs and not (time.column or time.file):
+        raise UsageError(f"{place}: {repairs[0]} repairs stamps. Give their column or file.")
+    try:
+        zoneinfo.ZoneInfo(time.zone)
+    except (ValueError, OSError, zoneinfo.ZoneInfoNotFoundError):
+        raise UsageError(f"{place}: zone is {excerpt(time.zone)}; it must be one such as Europe/Berlin.") from None
     if time.format:
         stamps.check_format(time.format, place)
     elif time.start and time.origin != "start" and time.rate_hz is None:
@@ -458,6 +468,17 @@ def _parse_time(table: Any, stream_place: str) -> Time:
             f'{place}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'
         )
     return time
+
+
+def _expect_repairs(stream: StreamLayout, place: str) -> None:
+    """Raise `UsageError` for repairs of stamps that do not fit the kind of stream."""
+    unfit = [name for name in REPAIRS if getattr(stream.time, name) and name not in ("offset_s", "ambiguous")]
+    if (stream.camera or stream.array) and unfit:
+        raise UsageError(f"{place}: time.{unfit[0]} is for tables. A camera keeps its frames as they come.")
+    if stream.time.split_at_reset and stream.time.sort:
+        raise UsageError(f"{place}: time.sort and time.split_at_reset exclude each other.")
+    if stream.time.split_at_reset and (stream.recording or stream.long or stream.contained):
+        raise UsageError(f"{place}: time.split_at_reset is for tables of one recording, one row per time.")
 
 
 def _parse_column(value: Any, place: str) -> ColumnRule:

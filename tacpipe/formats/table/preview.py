@@ -20,7 +20,6 @@ from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.container import (
     EpisodeContents,
     SourceStream,
-    Time,
     describe_unread,
     find_containers,
     no_container_error,
@@ -295,7 +294,7 @@ def _stream_text(stream: SourceStream) -> str:
     """Return the text of a ``[streams.NAME]`` entry with what a container declares."""
     rows = "" if stream.rows is None else f"  # {stream.rows} rows"
     lines = [f"[streams.{stream.name}]", f"source = {_quote(stream.source)}{rows}"]
-    declared = f"# time = {_time_text(stream.time)}, if nothing else is written here"
+    declared = f"# time = {stream.time.entry()}, if nothing else is written here"
     lines.append(declared if stream.time.is_declared else 'time = { rate_hz = "?" }  # not in the file')
     fields = [field for field in stream.schema if field.name != stream.time.column and not _is_time(field)]
     rules = [f"    {rule}" for rule in _column_rules(fields)]
@@ -304,17 +303,6 @@ def _stream_text(stream: SourceStream) -> str:
 
 def _is_time(field: pa.Field) -> bool:
     return (field.metadata or {}).get(b"quantity") == b"time"
-
-
-def _time_text(time: Time) -> str:
-    """Return a time as an entry of a layout. A unit is always written."""
-    entries = [("column", time.column), ("unit", time.unit if time.column else "s"), ("origin", time.origin)]
-    entries += [("zone", time.zone), ("start", time.start)]
-    # a default unit that differs from the time's, if that has a column
-    default = Time(unit="iso8601" if time.column and time.unit == "s" else "s")
-    entries_text = [f"{key} = {_quote(value)}" for key, value in entries if value != getattr(default, key)]
-    entries_text += [] if time.rate_hz is None else [f"rate_hz = {time.rate_hz:g}"]
-    return "{ " + ", ".join(entries_text) + " }"
 
 
 def _column_rules(fields: Sequence[pa.Field]) -> list[str]:

@@ -6,6 +6,7 @@ channels follow one another. So runs of rows are sorted, spilled to disk and mer
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,19 +16,23 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray, Floats, Times
+from tacpipe.arrays import AnyArray, Floats, Indices, Times, from_arrow
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import binary, columns, rows, stamps
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout
+from tacpipe.formats.table.repairs import StreamClock
 from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
+from tacpipe.formats.table.text import TextTable
 from tacpipe.io import files as file_system
 from tacpipe.io.spill import Piece, Spill, in_order
+from tacpipe.plugins.rows import drop_rows
 from tacpipe.plugins.stage import Shared
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
+from tacpipe.signals.sampling import burst_period_ns
 from tacpipe.video import files as video_files
 from tacpipe.video.images import frames_from_images
 
@@ -46,8 +51,10 @@ class LongTable:
     pieces: Sequence[Piece]
     spill: Spill
 
-    def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[tuple[Times, list[pa.Array]]]:
+    def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[Block]:
         """Yield timestamps in ns and one column per selected channel, with NaN for missing values, ordered by time.
+
+        Rows are counted by moment.
 
         Raises `TacpipeError` for two values of a channel at one time, and the errors of `columns.convert_column`.
         """
@@ -64,6 +71,7 @@ class LongTable:
                 yield (
                     t_ns[start : start + step],
                     [self._column(grid, channel, moment_count + start) for channel in channels],
+                    moment_count + np.arange(start, min(start + step, len(t_ns))),
                 )
             moment_count += len(t_ns)
 
@@ -110,13 +118,13 @@ def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, 
             f"[streams.{stream.name}] is in long form, so rows share moments: give the column of their stamps."
         )
     types = {**rows.reserved_types(file, stream), stream.long.channel: pa.string(), stream.long.value: pa.float64()}
-    spill = Spill()
+    spill, local_clock = Spill(), stamps.LocalClock(stream.time, in_order=False)
     codes: dict[str, int] = {}
     pieces: list[Piece] = []
     waiting: list[pa.Table] = []
     for block, in_file, place in rows.row_blocks(file, stream, types, recording, shared):
         columns = {
-            MOMENT: rows.stamps_of_column(block.column(stream.time.column), stream, place),
+            MOMENT: rows.stamps_of_column(block.column(stream.time.column), stream, place, local_clock),
             CHANNEL: _channel_codes(block.column(stream.long.channel), codes, stream, place),
             VALUE: block.column(stream.long.value).cast(pa.float64()).to_numpy(),
             ROW_INDEX: np.ascontiguousarray(in_file),
@@ -153,7 +161,8 @@ def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: Strea
     return numbers
 
 
-Block = tuple[Times | None, list[pa.Array]]  # timestamps, if rows have them, and columns
+# timestamps, if rows have them, columns, and the positions of the rows in the file
+Block = tuple[Times | None, list[pa.Array], Indices]
 
 
 def stream_batches(
@@ -162,21 +171,47 @@ def stream_batches(
     recording: str | None = None,
     shared: Shared | None = None,
     stamps_path: Path | None = None,
+    notes: list[str] | None = None,
 ) -> pa.RecordBatchReader:
     """Return the rows of a stream with ``t_ns``, read on demand; ``recording`` selects one of several in the file.
 
     With ``shared`` the file is split into its recordings once, instead of being read for each. ``stamps_path`` is the
-    timestamp file, if the layout names one.
+    timestamp file, if the layout names one. ``notes`` gets sentences about the rows, the last when they were all read.
 
     Raises `TacpipeError` with file, row and column for anything that does not match the layout, for decreasing
     timestamps, and for a file without rows, also while batches are read. One block is in memory, or one run of a table
     in long form.
     """
     stamps_ns = None if stamps_path is None else rows.stamps_of_file(stamps_path, stream)
-    return _batches(file, stream, recording, columns.NO_DECLARATION, {}, shared, stamps_ns)
+    return _batches(file, stream, recording, columns.NO_DECLARATION, {}, shared, stamps_ns, notes)
 
 
-def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
+def check_stamps(file: RowFile, stream: StreamLayout, stamps_path: Path | None = None) -> StreamClock:
+    """Return the clock of a file after reading only its stamps. Raises the errors of `stream_batches` about them."""
+    clock = StreamClock(stream, str(file.path), lambda row: f"{file.path}, {file.place(row)}", part=0)
+    blocks = _stamp_blocks(file, stream, stamps_path)
+    for t_ns, _, rows_in_file in _sort_rows(blocks) if stream.time.sort else _repair_stamps(blocks, clock):
+        assert t_ns is not None
+        clock.check(t_ns, rows_in_file)
+    clock.finish()
+    return clock
+
+
+def _stamp_blocks(file: RowFile, stream: StreamLayout, stamps_path: Path | None) -> Iterator[Block]:
+    """Yield the stamps of a file, or those in ``stamps_path``, without columns."""
+    if stamps_path is not None:
+        stamps_ns = rows.stamps_of_file(stamps_path, stream)
+        yield stamps_ns, [], np.arange(len(stamps_ns))
+        return
+    local_clock = stamps.LocalClock(stream.time)
+    types = rows.reserved_types(file, stream)
+    for block, rows_in_file, place in rows.row_blocks(file, stream, types, None, None):
+        yield rows.stamps_of_column(block.column(stream.time.column), stream, place, local_clock), [], rows_in_file
+
+
+def read_contained_stream(
+    path: Path, source: SourceStream, stream: StreamLayout, notes: list[str] | None = None
+) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a container's stream with ``t_ns``, as a table if it is already in memory.
 
     If the layout's ``stream`` sets no time, the container's time applies; if it sets no columns, the container's columns
@@ -201,8 +236,11 @@ def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout
             sort_column = clock.name
         metadata = schema.field_metadata(clock)
         time_metadata = {key: value for key, value in metadata.items() if key not in ("unit", "quantity")}
+        time_metadata |= {schema.STAMPS: schema.ARRIVAL} if clock.name == source.arrivals else {}
+    for reason, count in source.dropped.items():
+        drop_rows(stream.name, reason, count)
     file = ContainedRows(path, source, sort_column)
-    reader = _batches(file, timed_stream, None, declared, time_metadata)
+    reader = _batches(file, timed_stream, None, declared, time_metadata, notes=notes)
     table_or_reader = reader.read_all() if isinstance(source.content, pa.Table) else reader
     return frames_from_images(table_or_reader, f"{path}, {plain(source.source)}", timed_stream.time.rate_hz)
 
@@ -215,6 +253,7 @@ def _batches(
     about_time: Mapping[str, str],
     shared: Shared | None = None,
     stamps_ns: Times | None = None,
+    notes: list[str] | None = None,
 ) -> pa.RecordBatchReader:
     """Return the rows of a stream as batches with ``t_ns``; the timestamps ``stamps_ns`` (row,) may come from another file.
 
@@ -232,81 +271,145 @@ def _batches(
             f"{path} has no column {listed(missing, 3)}, which [streams.{stream.name}] names; it has {listed(names, 6)}."
         )
     blocks: Iterable[Block]
-    from_start = stream.time.origin == "start" or stream.time.rate_hz is not None
+    has_stamps = bool(stream.time.column or stream.time.file)
+    from_start = stream.time.origin == "start" or not has_stamps
     start_ns = _start_ns(stream) if from_start and not stream.time.format else 0
+    start_ns += round(stream.time.offset_s * 10**9)
+    part = None
+    if stream.time.split_at_reset:  # ``recording`` names a stretch between two settings of the clock
+        part, recording = 0 if recording is None else int(recording.rpartition("-")[2]) - 1, None
+    local_clock = stamps.LocalClock(stream.time)
     if stream.long is not None:
         long = read_long_table(file, stream, recording, shared)
-        chosen_columns = columns.choose_columns(stream, long.channels, path) if long.channels else []
+        chosen_columns = columns.choose_columns(stream, long.channels, path, notes=notes) if long.channels else []
         blocks = long.blocks(chosen_columns)
     else:
         chosen_columns = columns.choose_columns(
-            stream, [name for name in names if name not in reserved_names], path, declared
+            stream, [name for name in names if name not in reserved_names], path, declared, notes
         )
         types = {**rows.reserved_types(file, stream), **{column.name: column.read_as for column in chosen_columns}}
+        rounded: set[str] = set()
         allows_non_finite = bool(declared)  # only containers declare columns; their NaN and infinity are valid
         blocks = (
-            _convert_block(stream, block, chosen_columns, place, allows_non_finite)
-            for block, _, place in rows.row_blocks(file, stream, types, recording, shared)
+            (
+                *_convert_block(stream, block, chosen_columns, place, local_clock, allows_non_finite, rounded),
+                rows_in_file,
+            )
+            for block, rows_in_file, place in rows.row_blocks(file, stream, types, recording, shared)
         )
+        blocks = _note_at_end(blocks, file, rounded, notes)
     if stamps_ns is not None:
         blocks = _add_stamps_of_file(blocks, stamps_ns, file, stream)
-    output_schema = pa.schema([_time_field(stream, about_time), *(column.field for column in chosen_columns)])
-    checked_blocks = _check_stamps(blocks, file, stream, recording, start_ns)
-    return pa.RecordBatchReader.from_batches(
-        output_schema,
-        (batch for columns_of in checked_blocks for batch in pa.table(columns_of, output_schema).to_batches()),
+    stream_clock = StreamClock(
+        stream,
+        str(path) if recording is None else f"{path}, recording {plain(recording)}",
+        lambda row: f"{path}, moment {row + 1}" if stream.long else f"{path}, {file.place(row)}",
+        [] if notes is None else notes,
+        part,
+        is_contained=bool(declared),
+        is_measured=any(not pa.types.is_string(column.field.type) for column in chosen_columns),
+    )
+    checked_blocks = _check_stamps(blocks, stream_clock, start_ns)
+    first_blocks, fault = [], None
+    try:
+        first_blocks.append(next(checked_blocks))  # states whether stamps are arrivals
+    except TacpipeError as error:
+        fault = error  # raised when the rows are read, because the stream may not be selected
+    first_ns = from_arrow(first_blocks[0][0]) if first_blocks else np.zeros(0, np.int64)
+    output_schema = pa.schema(
+        [_time_field(stream_clock, about_time, first_ns), *(column.field for column in chosen_columns)]
     )
 
+    def read_batches() -> Iterator[pa.RecordBatch]:
+        if fault is not None:
+            raise fault
+        for columns_of in itertools.chain(first_blocks, checked_blocks):
+            yield from pa.table(columns_of, output_schema).to_batches()
 
-def _time_field(stream: StreamLayout, metadata: Mapping[str, str]) -> pa.Field:
-    """Return the field of ``t_ns`` with further metadata."""
-    if stream.time.rate_hz is not None:
+    return pa.RecordBatchReader.from_batches(output_schema, read_batches())
+
+
+def _note_at_end(blocks: Iterable[Block], file: RowFile, rounded: set[str], notes: list[str] | None) -> Iterator[Block]:
+    """Yield blocks, then add notes on ``rounded`` columns and on a last line that may have been cut."""
+    yield from blocks
+    if rounded and notes is not None:
+        notes.append(
+            f"{file.path}: {listed(sorted(rounded), 4)} has numbers beyond 2^53, which are rounded to floats. Set "
+            f'type = "uint64" or "int64" for whole numbers, else type = "float64".'
+        )
+    if notes is not None and isinstance(file, TextTable):
+        notes += file.describe_cut()
+
+
+def _time_field(clock: StreamClock, metadata: Mapping[str, str], first_ns: Times) -> pa.Field:
+    """Return the field of ``t_ns`` with further metadata.
+
+    ``first_ns`` (row,) are the first stamps; if they are arrivals and no rate is declared, they give the period.
+    """
+    time = clock.stream.time
+    if time.rate_hz is not None and not time.batch:
         field = schema.time_field("from rate")
-    elif stream.time.origin == "start":
-        field = schema.time_field("from the start of the recording")
     else:
-        field = schema.time_field()
+        arrivals = bool(clock.has_arrivals) or metadata.get(schema.STAMPS) == schema.ARRIVAL
+        period_ns = None if time.rate_hz is None else round(10**9 / time.rate_hz)
+        period_ns = burst_period_ns(first_ns) if arrivals and period_ns is None else period_ns
+        origin = "from the start of the recording" if time.origin == "start" else None
+        field = schema.time_field(origin, arrivals=arrivals, period_ns=period_ns)
     return field.with_metadata(schema.field_metadata(field) | dict(metadata))
 
 
-def _check_stamps(
-    blocks: Iterable[Block], file: RowFile, stream: StreamLayout, recording: str | None, start_ns: int
-) -> Iterator[list[pa.Array]]:
-    """Yield timestamps and columns of blocks, with ``start_ns`` added to the timestamps.
+def _check_stamps(blocks: Iterable[Block], clock: StreamClock, start_ns: int) -> Iterator[list[pa.Array]]:
+    """Yield repaired timestamps and the columns of blocks, with ``start_ns`` added to the timestamps.
 
-    Rows without timestamps get them from the rate, and times of day increase past midnight. Raises `TacpipeError` if
-    timestamps decrease or there are no rows.
+    Rows without timestamps get them from the rate. Raises `TacpipeError` for timestamps that cannot be right, and if
+    there are no rows. Adds notes of ``clock`` after the last block.
     """
-    row_count, last_ns = 0, None
-    are_times_of_day = bool(stream.time.format) and not stamps.has_date(stream.time.format)
-    for block_ns, arrays in blocks:
-        count = len(arrays[0])
-        if not count:
-            continue
-        if block_ns is None:
-            assert stream.time.rate_hz is not None
-            t_ns = resampling.uniform_offsets(row_count, count, stream.time.rate_hz)
+    time, row_count, first_ns = clock.stream.time, 0, 0
+    repaired = _repair_stamps(blocks, clock)
+    for block_ns, arrays, rows_in_file in _sort_rows(repaired) if time.sort else repaired:
+        retained = np.arange(len(rows_in_file))
+        if time.rate_hz is not None and not time.batch:
+            first_ns = first_ns if row_count or block_ns is None else int(block_ns[0])
+            t_ns = first_ns + resampling.uniform_offsets(row_count, len(retained), time.rate_hz)
         else:
-            t_ns = _add_days_past_midnight(block_ns, last_ns) if are_times_of_day else block_ns
-            _expect_ascending(t_ns, last_ns, row_count, file, recording)
-            last_ns = int(t_ns[-1])
-        row_count += count
-        yield [pa.array(t_ns + start_ns if start_ns else t_ns), *arrays]
+            assert block_ns is not None
+            retained = clock.check(block_ns, rows_in_file)
+            t_ns = block_ns[retained]
+        row_count += len(retained)
+        if len(retained):
+            yield [pa.array(t_ns + start_ns if start_ns else t_ns), *_take(arrays, retained)]
     if not row_count:
-        place = f" of recording {plain(recording)}" if recording else ""
-        raise TacpipeError(f"{file.path} holds no row{place}. Remove it, or record it again.")
+        raise TacpipeError(f"{clock.file} holds no row. Remove it, or record it again.")
+    clock.finish()
 
 
-def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
-    """Return times of day with a day added after each midnight; ``last_ns`` is the time before them.
+def _repair_stamps(blocks: Iterable[Block], clock: StreamClock) -> Iterator[Block]:
+    """Yield the blocks with repaired timestamps, without the rows that the layout drops."""
+    for raw_ns, arrays, rows_in_file in blocks:
+        t_ns, retained = clock.repair(raw_ns, rows_in_file)
+        if len(retained):
+            yield t_ns, _take(arrays, retained), rows_in_file[retained]
 
-    >>> _add_days_past_midnight(np.array([86_399, 1]) * 10**9, None)
-    array([86399000000000, 86401000000000])
-    """
-    day_ns = stamps.DAY_NS
-    previous_ns = int(t_ns[0]) if last_ns is None else last_ns
-    days = max(0, round((previous_ns - int(t_ns[0])) / day_ns))  # days before the first time
-    return t_ns + (days + np.cumsum(np.diff(t_ns, prepend=t_ns[0]) < -day_ns // 2)) * day_ns
+
+def _take(arrays: list[pa.Array], retained: AnyArray) -> list[pa.Array]:
+    """Return the retained rows of columns."""
+    is_full = not arrays or len(retained) == len(arrays[0])
+    return arrays if is_full else [array.take(pa.array(retained)) for array in arrays]
+
+
+def _sort_rows(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Yield the rows of all blocks sorted by timestamp, from a spill file."""
+    spill = Spill()
+    pieces: list[Piece] = []
+    for t_ns, arrays, rows_in_file in blocks:
+        names = [MOMENT, ROW_INDEX, *map(str, range(len(arrays)))]
+        pieces += spill.add_run(pa.table([pa.array(t_ns), pa.array(rows_in_file), *arrays], names), MOMENT)
+    waiting: list[pa.Table] = []
+    for table in itertools.chain(in_order(pieces, spill.read, MOMENT), [None]):
+        waiting += [] if table is None else [table]
+        if waiting and (table is None or sum(part.num_rows for part in waiting) >= RUN_ROWS):
+            run, waiting = pa.concat_tables(waiting).combine_chunks(), []
+            yield run.column(MOMENT).to_numpy(), run.columns[2:], run.column(ROW_INDEX).to_numpy()
 
 
 def _add_stamps_of_file(
@@ -314,11 +417,11 @@ def _add_stamps_of_file(
 ) -> Iterator[Block]:
     """Yield blocks with timestamps from another file. Raises `TacpipeError` if their number differs from that of rows."""
     row_count = 0
-    for _, arrays in blocks:
+    for _, arrays, rows_in_file in blocks:
         count = len(arrays[0])
         if row_count + count > len(stamps_ns):
             raise TacpipeError(_unequal_lengths(file, stream, "more rows", stamps_ns))
-        yield stamps_ns[row_count : row_count + count], arrays
+        yield stamps_ns[row_count : row_count + count], arrays, rows_in_file
         row_count += count
     if row_count < len(stamps_ns):
         raise TacpipeError(_unequal_lengths(file, stream, f"{row_count} rows", stamps_ns))
@@ -328,31 +431,23 @@ def _unequal_lengths(file: RowFile, stream: StreamLayout, rows_there: str, stamp
     return f"{file.path} has {rows_there}, and {plain(stream.time.file)} has {len(stamps_ns)} stamps. Copy both again."
 
 
-def _expect_ascending(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
-    """Raise `TacpipeError` if timestamps decrease; ``last_ns`` is the previous one, after ``before`` rows."""
-    steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
-    backwards = np.flatnonzero(steps_ns < 0)
-    if not len(backwards):
-        return
-    row = before + int(backwards[0])
-    place = (
-        f"{file.path}, {file.place(row)}" if recording is None else f"{file.path}, row {row + 1} of {plain(recording)}"
-    )
-    raise TacpipeError(
-        f"{place}: the stamp is {-steps_ns[backwards[0]] / 1e9:g} s before that of the row above. Sort the rows, or "
-        f"cut the file where its clock was set."
-    )
-
-
 def _convert_block(
-    stream: StreamLayout, block: pa.Table, chosen_columns: list[ChosenColumn], place: Place, as_is: bool
-) -> Block:
+    stream: StreamLayout,
+    block: pa.Table,
+    chosen_columns: list[ChosenColumn],
+    place: Place,
+    local_clock: stamps.LocalClock,
+    as_is: bool,
+    rounded: set[str],
+) -> tuple[Times | None, list[pa.Array]]:
     """Return the timestamps of a block, or None without a time column, and its columns in their declared types.
 
-    ``as_is``: NaN and infinity are values. Raises `TacpipeError` for values that do not fit their type.
+    ``local_clock`` reads the local times of all blocks. With ``as_is``, NaN and infinity are values.
+    ``rounded`` gets the names of columns with numbers that a float does not hold. Raises
+    `TacpipeError` for values that do not fit their type.
     """
     clock = "" if stream.time.file else stream.time.column
-    t_ns = rows.stamps_of_column(block.column(clock), stream, place) if clock else None
+    t_ns = rows.stamps_of_column(block.column(clock), stream, place, local_clock) if clock else None
     arrays = []
     for column in chosen_columns:
         try:
@@ -363,10 +458,14 @@ def _convert_block(
             )
         except CellError as error:
             raise TacpipeError(f"{place(error.row)}, column {plain(column.name)} {error}.") from error
+        if not as_is and columns.exceeds_floats(arrays[-1], column):
+            rounded.add(column.name)
     return t_ns, arrays
 
 
-def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = None) -> pa.RecordBatchReader:
+def camera_batches(
+    path: Path, stream: StreamLayout, stamps_path: Path | None = None, notes: list[str] | None = None
+) -> pa.RecordBatchReader:
     """Return the frames of a video file or a folder of images with ``t_ns``, read on demand.
 
     Timestamps come from ``stamps_path`` if the layout names a timestamp file, else from the rate or the images' names,
@@ -378,7 +477,7 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
     count = len(images) if frames is None else len(frames)
     origin = None
     numbers = None if frames is None else frames.counter()
-    if stamps_path is not None:
+    if stamps_path is not None and stream.time.rate_hz is None:
         t_ns = rows.stamps_of_file(stamps_path, stream)
         if len(t_ns) != count:
             raise TacpipeError(
@@ -398,12 +497,15 @@ def camera_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = 
     backwards = np.flatnonzero(np.diff(t_ns) < 0)
     if len(backwards):
         raise TacpipeError(
-            f"{stamps_path or path}, frame {backwards[0] + 2}: the stamp is before that of the frame above. Sort the "
-            f"stamps, or cut the video where its clock was set."
+            f"{stamps_path or path}, frame {backwards[0] + 2}: the stamp is before that of the frame above. Replace the "
+            f"stamps with `rate_hz` as the time of [streams.{stream.name}]."
         )
+    equal = int((np.diff(t_ns) == 0).sum())
+    if equal and notes is not None:
+        notes.append(f"{equal} of {count} frames of {stream.name} share a stamp with the frame before.")
     if stream.time.origin == "start":
         origin = "from the start of the recording"
-    t_ns = t_ns + (_start_ns(stream) if origin else 0)
+    t_ns = t_ns + (_start_ns(stream) if origin else 0) + round(stream.time.offset_s * 10**9)
     if frames is None:
         return video_files.read_images(images, t_ns, origin)
     return video_files.read_stream(path, frames, t_ns, origin)

@@ -25,12 +25,19 @@ from tacpipe.formats.container import (
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
 from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout, extension
-from tacpipe.formats.table.reading import camera_batches, image_batches, read_contained_stream, stream_batches
+from tacpipe.formats.table.reading import (
+    camera_batches,
+    check_stamps,
+    image_batches,
+    read_contained_stream,
+    stream_batches,
+)
 from tacpipe.io import files as file_system
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 from tacpipe.video.files import IMAGE_CODECS
 
+PART = "part-"  # start of the name of a stretch between two settings of the clock
 CONTAINER = "container"  # key of the file that contains all streams of a source
 
 
@@ -182,11 +189,16 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
     ``values`` are those of the placeholders. Raises `UsageError` if the files contain different recordings.
     """
     shared_streams = [
-        stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
+        stream
+        for stream in layout.streams
+        if (stream.recording or stream.contained or stream.time.split_at_reset) and stream.name in files
     ]
     names_by_stream = {}
     for stream in shared_streams:
-        names = _names_in_file(files[stream.name], stream)
+        if stream.time.split_at_reset:
+            names = _parts_of_file(files[stream.name], stream, files.get(f"{stream.name}{STAMPS}"))
+        else:
+            names = _names_in_file(files[stream.name], stream)
         if names is not None:
             names_by_stream[stream.name] = names
     if not names_by_stream:
@@ -200,10 +212,27 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
                 f"{listed(odd_names, 3)} is "
                 f"in only one of them."
             )
+    if any(stream.time.split_at_reset for stream in shared_streams):
+        name = _recording_name(layout, values, files)
+        return [RecordingFiles(f"{name}-{part.removeprefix(PART)}", files, values, part) for part in sorted(first)]
     return [
         RecordingFiles(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
         for name in sorted(first)
     ]
+
+
+def _parts_of_file(path: Path, stream: StreamLayout, stamps_path: Path | None) -> set[str] | None:
+    """Return the names of the stretches between settings of a file's clock, or None if the clock was never set.
+
+    A file with wrong stamps is one recording, whose reading reports them.
+    """
+    try:
+        count = check_stamps(rows.open_rows(path, stream), stream, stamps_path).parts
+    except TacpipeError as error:
+        if not is_input_error(error):
+            raise
+        return None
+    return None if count == 1 else {f"{PART}{part:0{len(str(count))}}" for part in range(1, count + 1)}
 
 
 def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
@@ -234,20 +263,43 @@ def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
 
 
 def _recording_name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) -> str:
-    """Return the name of a recording, by default from the values of its placeholders or the name of its first file.
+    """Return the name of a recording, by default of its folder, from its placeholders, or of its first file.
 
     Raises `UsageError` if it is not a valid name.
     """
     if layout.name:
         text = pattern.fill_pattern(layout.name, values)
+    elif len(values) == 1 and (own_name := folder_name(layout, values)):
+        text = own_name
     elif values:
-        text = "-".join(f"{name}-{value}" if value.isdigit() else value for name, value in values.items())
+        text = joined_values(values)
     else:
         text = next(iter(files.values())).name.partition(".")[0]
     name = valid_name(text)
     if not name:
         raise UsageError(f"{plain(text)} cannot be a recording's name. Set name in [recordings].")
     return name
+
+
+def joined_values(values: Mapping[str, str]) -> str:
+    """Return the values of placeholders joined by dashes, numbers after the name of their placeholder.
+
+    >>> joined_values({"object": "cup", "trial": "3"})
+    'cup-trial-3'
+    """
+    return "-".join(f"{name}-{value}" if value.isdigit() else value for name, value in values.items())
+
+
+def folder_name(layout: Layout, values: Mapping[str, str]) -> str:
+    """Return the name of the folder or file that contains the only placeholder, or "" if it differs between streams."""
+    names = set()
+    for stream in layout.streams:
+        segments = [segment for segment in stream.files.split("/") if pattern.placeholders(segment)]
+        if len(segments) != 1 or "*" in segments[0] or set(pattern.placeholders(segments[0])) != set(values):
+            return ""
+        name = pattern.fill_pattern(segments[0], values)
+        names.add(name.partition(".")[0] if stream.files.endswith(segments[0]) and stream.format != "images" else name)
+    return names.pop() if len(names) == 1 else ""
 
 
 def _describe_values(names: tuple[str, ...], values: tuple[str, ...]) -> str:
@@ -284,21 +336,26 @@ def read_streams(
         if stream.name not in paths:
             continue
         if stream.camera:
-            tables[stream.name] = camera_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"))
+            tables[stream.name] = camera_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"), notes)
         elif stream.array:
             tables[stream.name] = image_batches(paths[stream.name], stream, paths.get(f"{stream.name}{STAMPS}"))
         elif stream.contained:
             contained_streams.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
             tables[stream.name] = stream_batches(
-                rows.open_rows(paths[stream.name], stream), stream, episode, shared, paths.get(f"{stream.name}{STAMPS}")
+                rows.open_rows(paths[stream.name], stream),
+                stream,
+                episode,
+                shared,
+                paths.get(f"{stream.name}{STAMPS}"),
+                notes,
             )
     for (kind, path), container_streams in contained_streams.items():
         contents = open_container(kind, path).read([stream.source for stream in container_streams], episode)
         stream_by_source = parts_by_name(((stream.source, stream) for stream in contents.streams), path, "stream")
         for stream in container_streams:
             if stream.source in stream_by_source:
-                tables[stream.name] = read_contained_stream(path, stream_by_source[stream.source], stream)
+                tables[stream.name] = read_contained_stream(path, stream_by_source[stream.source], stream, notes)
             elif not stream.optional:
                 raise _missing_stream_error(path, stream, contents, open_container(kind, path).look(episode))
         attributes |= contents.attributes
@@ -352,7 +409,7 @@ def read_container(kind: str, path: Path, episode: str | None) -> RecordedStream
     stream_by_name = parts_by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
         name: _with_rate_note(
-            read_contained_stream(path, stream, StreamLayout(name, source=stream.source)), name, notes
+            read_contained_stream(path, stream, StreamLayout(name, source=stream.source), notes), name, notes
         )
         for name, stream in stream_by_name.items()
         if stream.rows is None or stream.rows

@@ -199,8 +199,9 @@ def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
             f"in its time."
         )
     stamps_layout = replace(stamps_layout, time=replace(stamps_layout.time, column=column))
+    clock = stamps.LocalClock(stream.time)
     stamps_ns = [
-        stamps_of_column(block.column(column), stamps_layout, place)
+        stamps_of_column(block.column(column), stamps_layout, place, clock)
         for block, _, place in row_blocks(file, stamps_layout, reserved_types(file, stamps_layout), None, None)
     ]
     return np.concatenate(stamps_ns) if stamps_ns else np.zeros(0, np.int64)
@@ -262,10 +263,15 @@ def _select_rows(
         start_row += block.num_rows
 
 
-def stamps_of_column(column: pa.ChunkedArray, stream: StreamLayout, place: Place) -> Times:
-    """Return the timestamps in a column in ns (row,). Raises `TacpipeError` with the row for an invalid one."""
+def stamps_of_column(
+    column: pa.ChunkedArray, stream: StreamLayout, place: Place, clock: stamps.LocalClock | None = None
+) -> Times:
+    """Return the timestamps in a column in ns (row,). Raises `TacpipeError` with the row for an invalid one.
+
+    ``clock`` reads the local times of all blocks of a file.
+    """
     try:
-        return stamps.nanoseconds(column, stream.time)
+        return stamps.nanoseconds(column, stream.time, clock)
     except stamps.StampError as error:
         raise TacpipeError(
             f"{place(error.row)}, column {plain(stream.time.column)} holds {excerpt(error.value)}; it must be "

@@ -6,7 +6,9 @@ today's Unix time is 238 ns.
 
 from __future__ import annotations
 
+import datetime
 import re
+import zoneinfo
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,8 +140,75 @@ class StampError(ValueError):
         self.row, self.value, self.expected = row, value, expected
 
 
-def nanoseconds(column: pa.Array, time: Time) -> Int64s:
+class LocalClock:
+    """Converts local times of a zone to UTC, block by block; rows in order settle the hour that summer time repeats."""
+
+    def __init__(self, time: Time, *, in_order: bool = True) -> None:
+        """Read times in the zone of ``time``. Without ``in_order``, only ``time.ambiguous`` settles the repeated hour."""
+        self.zone, self._ambiguous, self._in_order = time.zone, time.ambiguous, in_order
+        self.has_zones: bool | None = None  # None before the first block was read
+        self._last_ns: int | None = None  # local time of the last row
+        self._repeats = False  # True from the second reading of the repeated hour on
+
+    def to_utc(self, local: pa.Array) -> Int64s:
+        """Return local timestamps in ns UTC (row,). Raises `StampError` for a time that is not one moment."""
+        if self.zone == "UTC":
+            return _integers(local)
+        local = local.cast(pa.timestamp("ns"))
+
+        def read_as(ambiguous: str, nonexistent: str = "earliest") -> Int64s:
+            return _integers(pc.assume_timezone(local, self.zone, ambiguous=ambiguous, nonexistent=nonexistent))
+
+        local_ns, earlier, later = _integers(local), read_as("earliest"), read_as("latest")
+        missing = earlier != read_as("earliest", "latest")
+        if missing.any():
+            row = int(missing.argmax())
+            expected = f"a time that exists in {self.zone} ({self._readings(local[row])})"
+            remedy = 'Set time.zone to that of the clock, such as "UTC" or "Etc/GMT-1"'
+            raise StampError(row, str(local[row]), f"{expected}. {remedy}")
+        repeated = earlier != later
+        if not repeated.any():
+            self._last_ns = int(local_ns[-1]) if len(local_ns) else self._last_ns
+            return earlier
+        return np.where(repeated & self._is_later(local, local_ns, earlier, later, repeated), later, earlier)
+
+    def _is_later(
+        self, local: pa.Array, local_ns: Int64s, earlier: Int64s, later: Int64s, repeated: Bools
+    ) -> Bools | bool:
+        """Return whether the later reading of a repeated time applies, shape (row,) or one value for all rows."""
+        first, last = int(repeated.argmax()), len(repeated) - int(repeated[::-1].argmax()) - 1
+        before = self._last_ns if first == 0 else int(local_ns[first - 1])
+        back = repeated & (np.diff(local_ns, prepend=local_ns[0] if before is None else before) < -(10**9))
+        began = self._repeats
+        self._last_ns, self._repeats = int(local_ns[-1]), began or bool(back.any())
+        if self._in_order and (self._repeats or before is not None):
+            return began | np.logical_or.accumulate(back)
+        hour_after_follows = self._in_order and last + 1 < len(later) and bool(later[last + 1] >= later[last])
+        if not hour_after_follows and not self._ambiguous:
+            expected = f"a time that occurs once in {self.zone} ({self._readings(local[first])})"
+            remedy = 'Set time.ambiguous = "earlier" or "later"'
+            raise StampError(first, str(local[first]), f"{expected}. {remedy}")
+        self._repeats = hour_after_follows or self._ambiguous == "later"
+        return self._repeats
+
+    def _readings(self, local: pa.Scalar) -> str:
+        """Return the two readings of a local time that occurs twice or never."""
+        at = datetime.datetime.fromisoformat(str(local)[:26])
+        both = [at.replace(tzinfo=zoneinfo.ZoneInfo(self.zone), fold=fold) for fold in (0, 1)]
+        utc = [moment.astimezone(datetime.UTC).strftime("%H:%M:%S UTC") for moment in both]
+        return f"as {both[0].tzname()} it is {utc[0]}, as {both[1].tzname()} {utc[1]}"
+
+
+def _integers(stamps: pa.Array) -> Int64s:
+    """Return timestamps as integers in ns (row,)."""
+    zone = stamps.type.tz
+    return np.asarray(stamps.cast(pa.timestamp("ns", zone)).cast(pa.int64()).to_numpy(zero_copy_only=False), np.int64)
+
+
+def nanoseconds(column: pa.Array, time: Time, clock: LocalClock | None = None) -> Int64s:
     """Return timestamps in nanoseconds (time,), converted from the unit of ``time`` and rounded half to even.
+
+    ``clock`` knows the blocks before, for local times.
 
     Raises `StampError` for a timestamp that is missing, is not a time, or does not fit in 64 bits (the year 2262).
 
@@ -150,17 +219,17 @@ def nanoseconds(column: pa.Array, time: Time) -> Int64s:
     """
     values = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     _refuse_flagged(values.is_null(), values, "a time; the cell is empty")
+    clock = clock or LocalClock(time)
     if pa.types.is_timestamp(values.type):
-        is_local = values.type.tz is None and time.zone != "UTC"
-        zoned = pc.assume_timezone(values, time.zone) if is_local else values
-        stamps = _cast(zoned, pa.timestamp("ns", zoned.type.tz), IN_RANGE).cast(pa.int64())
-        return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
+        in_ns = _cast(values, pa.timestamp("ns", values.type.tz), IN_RANGE)
+        return clock.to_utc(in_ns) if values.type.tz is None else _integers(in_ns)
     if pa.types.is_time(values.type):
-        return _to_utc(np.asarray(values.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
+        of_day_ns = np.asarray(values.cast(pa.time64("ns")).cast(pa.int64()).to_numpy())
+        return clock.to_utc(pa.array(of_day_ns + _day_ns(time)).cast(pa.timestamp("ns")))
     if time.format:
-        return _from_format(values, time)
+        return _from_format(values, time, clock)
     if time.unit == "iso8601":
-        return _from_iso_text(values, time.zone)
+        return _from_iso_text(values, clock)
     unit = time.unit
     if pa.types.is_decimal(values.type):
         return _from_decimals(values, DIGITS[unit])
@@ -169,43 +238,34 @@ def nanoseconds(column: pa.Array, time: Time) -> Int64s:
     return _from_floats(values, 10 ** DIGITS[unit])
 
 
-def _from_iso_text(column: pa.Array, zone: str) -> Int64s:
+def _from_iso_text(column: pa.Array, clock: LocalClock) -> Int64s:
     """Return the times in ISO 8601 texts in ns (row,).
 
-    Texts have a zone if the first has one, else they are in ``zone``.
+    Texts have a zone if the first of the file has one, else they are local times of ``clock``.
 
     Raises `StampError` for a text of another form.
     """
     text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
-    has_zone = [bool(_ZONED.fullmatch(first)) for first in text[:1].to_pylist()]
-    if has_zone == [True]:
+    if clock.has_zones is None:
+        clock.has_zones = any(bool(_ZONED.fullmatch(first)) for first in text[:1].to_pylist())
+    if clock.has_zones:
         expected = "a time in ISO 8601, with a zone, as the first row has one"
-        stamps = _cast(text, pa.timestamp("ns", "UTC"), expected)
-    else:
-        expected = "a time in ISO 8601, without a zone, as the first row has none"
-        stamps = pc.assume_timezone(_cast(text, pa.timestamp("ns"), expected), zone)
-    t_ns: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
-    return t_ns
+        return _integers(_cast(text, pa.timestamp("ns", "UTC"), expected))
+    expected = "a time in ISO 8601, without a zone, as the first row has none"
+    return clock.to_utc(_cast(text, pa.timestamp("ns"), expected))
 
 
-def _from_format(column: pa.Array, time: Time) -> Int64s:
+def _from_format(column: pa.Array, time: Time, clock: LocalClock) -> Int64s:
     """Return the timestamps (row,) in ns UTC of a column of text in the format of ``time``."""
     t_ns, valid = parse_stamps(column.cast(pa.string()), time.format)
     _refuse_flagged(pa.array(~valid), column, f"a time in the format {time.format}")
-    return _to_utc(t_ns if has_date(time.format) else t_ns + _day_ns(time), time.zone)
+    local_ns = t_ns if has_date(time.format) else t_ns + _day_ns(time)
+    return clock.to_utc(pa.array(local_ns).cast(pa.timestamp("ns")))
 
 
 def _day_ns(time: Time) -> int:
     """Return the start of the day for times of day: that of ``start``, or else 1970-01-01."""
     return int(np.datetime64(time.start[:10], "D").astype("datetime64[ns]").astype(np.int64)) if time.start else 0
-
-
-def _to_utc(t_ns: Int64s, zone: str) -> Int64s:
-    """Convert nanoseconds (row,) of local time in a zone to UTC."""
-    if zone == "UTC":
-        return t_ns
-    stamps = pc.assume_timezone(pa.array(t_ns).cast(pa.timestamp("ns")), zone, ambiguous="earliest")
-    return np.asarray(stamps.cast(pa.int64()).to_numpy(zero_copy_only=False), np.int64)
 
 
 def _from_decimals(column: pa.Array, digits: int) -> Int64s:

@@ -90,6 +90,8 @@ class _Recoded(io.RawIOBase):
 
 BLOCK_BYTES = 1 << 24  # smaller than the blocks that the C library returns to the system after each use
 BOM = b"\xef\xbb\xbf"  # byte order mark that some editors write at the start
+TAIL_BYTES = 1 << 16  # number of bytes examined at the end of a file
+MIN_LINES = 5  # minimum number of lines for comparing the last cell
 MAX_LINE_BYTES = 1 << 24  # a file with longer lines is not a text table
 _NOT_BLANK = re.compile(rb"\S")
 
@@ -243,6 +245,25 @@ class TextTable:
                     yield number, next(csv.reader([text], delimiter=separator))
             except csv.Error as error:
                 raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
+
+    def describe_cut(self) -> list[str]:
+        """Return a note if the file ends within a line whose last cell is shorter than the others of its column."""
+        with open_text(self.path, self.stream.encoding) as file:
+            if isinstance(file, io.BufferedReader) and file.seekable():
+                file.seek(max(0, file.seek(0, io.SEEK_END) - TAIL_BYTES))
+            tail = b""
+            while block := file.read(BLOCK_BYTES):
+                tail = (tail + block)[-TAIL_BYTES:]
+        if not tail or tail.endswith((b"\n", b"\r")):
+            return []
+        separator = self.stream.separator_of(self.path).encode()
+        lines = [line for line in tail.splitlines()[1:] if line.strip()]
+        lengths = [len(line.rpartition(separator)[2].strip()) for line in lines]
+        if len(lengths) < MIN_LINES or lengths[-1] >= min(lengths[:-1]):
+            return []
+        cell = excerpt(lines[-1].rpartition(separator)[2].decode(errors="replace"))
+        place = f"{self.path}: the last line has no end, and its last cell {cell}"
+        return [f"{place} is shorter than those above it. If the file was cut, copy it again or remove the line."]
 
     def _endless_line(self) -> TacpipeError:
         return TacpipeError(f"{self.path} has a line of over {MAX_LINE_BYTES} bytes; it is not a text table.")

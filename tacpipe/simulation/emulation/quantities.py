@@ -267,6 +267,7 @@ FULL = {  # full range in SI units of devices that send counts
     "deflection": 10.0, "external_torque": 90.0,
 }  # fmt: skip
 SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities that taxels share
+FLUX_UT = 0.15  # resolution of a magnetometer; drivers reject values that are much smaller, but not 0
 NOISE = 0.002  # standard deviation as a fraction of the full range
 TARGETS = ("target_position", "target_orientation")  # values that a controller computes exactly
 # quantities without noise
@@ -292,7 +293,8 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
     clipped.
     """
     kind = np.dtype(field.type.to_pandas_dtype())
-    scale = unit_scale(metadata_of(field, "unit") or "1")
+    unit = metadata_of(field, "unit") or "1"
+    scale = unit_scale(unit)
     if scale is None and quantity in FULL:
         full_scale = COUNTS.get(kind.name, FLOAT_COUNTS)
         # signed values in an unsigned type
@@ -300,6 +302,8 @@ def _column(field: pa.Field, values: Floats, full: float, quantity: str) -> AnyA
         scaled = offset + values * (full_scale / full)
     else:
         scaled = values * (scale or 1.0)
+    if unit == "uT":
+        scaled = FLUX_UT * np.rint(scaled / FLUX_UT)
     if kind.kind in "iu":
         limits = np.iinfo(kind)
         scaled = np.rint(scaled).clip(limits.min, limits.max)

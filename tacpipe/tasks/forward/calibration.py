@@ -79,6 +79,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Window
             track = forecaster.track(shard)
             check_rate(track, forecaster)
             starts = fewer(track.starts(forecaster.context, forecaster.horizon), limit)
+            track.count_rows(starts, forecaster.context + forecaster.horizon)
             for forecast in forecasts(forecaster, track, starts):
                 past, truth = track.tactile[forecast.past], track.tactile[forecast.future]
                 parts.append(

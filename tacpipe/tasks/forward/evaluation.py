@@ -257,6 +257,7 @@ def _predictions(
     each one predictor, are in memory at a time.
     """
     starts = track.starts(forecaster.context, forecaster.horizon)
+    track.count_rows(starts, forecaster.context + forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     no_windows = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, no_windows))

@@ -68,6 +68,7 @@ def _collect_predictions(
         track = forecaster.track(shard)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
+        track.count_rows(starts, forecaster.context + forecaster.horizon)
         gathered[name] = Gathered(spill, empty)
         for forecast in forecasts(forecaster, track, starts):
             # (step, channel, window)

@@ -21,9 +21,10 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.io.columns import Columns
 from tacpipe.io.spill import MappedArrays
+from tacpipe.plugins.rows import IN_GAP, MEASURED, NO_CONTACT, RowCounts, count_rows
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
-from tacpipe.signals.runs import run_starts, window_starts
+from tacpipe.signals.runs import rows_in_windows, run_starts, window_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -139,11 +140,16 @@ class Track:
     object: str | None = None  # grasped object, if it is labelled
     # (time, 6), velocities of a plan with these poses; None: the velocities in ``arm``
     plan_velocity: AnyFloats | None = None
+    measured: Bools | None = None  # (time,): True if the next row had arrived with a row; None: nowhere
     storage: MappedArrays = field(default_factory=lambda: MappedArrays(sys.maxsize))  # contains the rows
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
-        """Return the first row of each window of ``context + horizon`` rows (window,)."""
-        return window_starts(self.groups, self.usable, context, horizon, stride)
+        """Return the first row of each window of ``context + horizon`` rows (window,).
+
+        A window whose first target had already arrived with its last input row is no forecast, and left out.
+        """
+        starts = window_starts(self.groups, self.usable, context, horizon, stride)
+        return starts if self.measured is None else starts[~self.measured[starts + context - 1]]
 
     def rows_between(self, first: int, last: int) -> Track:
         """Return the rows from ``first`` to ``last``, exclusive."""
@@ -154,8 +160,9 @@ class Track:
         selected = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
-        if self.plan_velocity is not None:
-            selected["plan_velocity"] = self.plan_velocity[first:last]
+        for name in ("plan_velocity", "measured"):
+            if getattr(self, name) is not None:
+                selected[name] = getattr(self, name)[first:last]
         return replace(self, latent=slice_rows(self.latent), tactile=slice_rows(self.tactile), **selected)
 
     def planned_arm(self, rows: Int64s) -> AnyFloats:
@@ -164,6 +171,14 @@ class Track:
         if self.plan_velocity is not None:
             arm[..., POSED:] = self.plan_velocity[rows]
         return arm
+
+    def count_rows(self, starts: Int64s, length: int, *, only_contact: bool = False) -> None:
+        """Count the rows in windows of ``length`` rows from ``starts`` (window,) as used."""
+        inside = rows_in_windows(starts, length, len(self.t_ns))
+        reasons = [(IN_GAP, ~self.usable), (NO_CONTACT, (self.contact < 0) & only_contact)]
+        if self.measured is not None:
+            reasons.append((MEASURED, self.measured))
+        count_rows(self.name, "", RowCounts.from_masks(inside, reasons))
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first row of each window within a single contact (window,)."""
@@ -274,7 +289,8 @@ def track(
     """
     table, storage = shard.columns(), storage or MappedArrays(IN_MEMORY)
     try:
-        codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"))
+        is_fitted = not isinstance(codec, codecs.Raw)
+        codecs.check_channels(codec.channels, tactile.columns(table.schema, "tactile"), is_fitted=is_fitted)
         counts_above_rest = above_rest(table, codec.channels, storage)
         finite = counts_above_rest.finite(storage)
         if codec.kind == "raw":
@@ -285,7 +301,10 @@ def track(
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         arm, plan_velocity = _motion(table, pose, storage)
         finger = _finger_width(table)
-        gaps = tactile.gap_mask(table)
+        gaps = streams.unusable_rows(table)
+        measured = None
+        if streams.ARRIVAL in table.column_names:
+            measured = np.append(np.diff(whole_numbers(table, streams.ARRIVAL)) == 0, False)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     del table
@@ -306,6 +325,7 @@ def track(
         timeline,
         None if labelled_object is None else str(labelled_object),
         plan_velocity,
+        measured if measured is not None and measured.any() else None,
         storage,
     )
 

@@ -254,6 +254,8 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str, ma
     starts = [
         (track.starts if params.windows == "all" else track.contact_starts)(context, horizon, stride) for track in part
     ]
+    for track, starts_in_track in zip(part, starts, strict=True):
+        track.count_rows(starts_in_track, context + horizon, only_contact=params.windows != "all")
     return rows_of_tracks(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
 
 

@@ -14,6 +14,7 @@ from tacpipe.channels.streams import missing_channel_error
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import Assignments, CommaList
+from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.printable import listed
 from tacpipe.tasks.material.headline import NUMBERS, UNKNOWN, Naming
 from tacpipe.tasks.material.params import StoredLayout
@@ -153,6 +154,7 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Sl
     if not channels:
         raise missing_channel_error(shard.name, " or ".join(quantities), table.schema)
     values = _columns(table, channels)
+    count_rows(shard.name, STREAM if STREAM in shard.streams else "", RowCounts.all_used(len(values)))
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
         raise TacpipeError(

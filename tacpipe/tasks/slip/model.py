@@ -86,6 +86,7 @@ class SlipModel:
         """Return the predictions of one recording."""
         track = self.reader.track(recording)
         rows = np.flatnonzero(track.ready)
+        self.reader.count_rows(track, rows)
         return self.to_table(track, rows, self.scorer.score(self.reader, track, rows))
 
     def to_table(self, track: GraspTrack, rows: Indices, scores: Floats) -> pa.Table:

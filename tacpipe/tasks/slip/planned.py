@@ -13,6 +13,7 @@ from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.datasets.dataset import Recording
 from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory, PosePlan
+from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.slip.features import EPSILON, NAMES
 
@@ -46,7 +47,8 @@ class PlannedMotion:
         if PLAN not in recording.streams:
             return None
         plans = cls()
-        plans.push(recording.table(PLAN))
+        plans.push(table := recording.table(PLAN))
+        count_rows(recording.name, PLAN, RowCounts.all_used(table.num_rows))
         return plans
 
     def push(self, batch: pa.Table | BatchColumns) -> Times:

@@ -13,7 +13,9 @@ from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
 from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW, RowCounts, count_rows
 from tacpipe.sensors.plan import NAME as PLAN
+from tacpipe.signals.runs import rows_in_windows
 from tacpipe.tasks.slip.features import FingerLayout, combine_fingers, feature_names, finger_features
 from tacpipe.tasks.slip.labels import SlipLabels, read_labels
 from tacpipe.tasks.slip.planned import (
@@ -217,7 +219,7 @@ class FingerReader:
         ready = np.asarray((newest >= np.array(first)).all(axis=1))
         start_ns = min((int(signal.t_ns[0]) for signal in fingers if len(signal.t_ns)), default=0)
         label = str(recording.attributes.get("object") or recording.name)
-        return GraspTrack(
+        track = GraspTrack(
             recording.name,
             label,
             recording.digest,
@@ -230,6 +232,17 @@ class FingerReader:
             recording,
             PlannedMotion.from_recording(recording) if self.reads_plans else None,
         )
+        self.count_rows(track, np.zeros(0, np.intp), NO_WINDOW if track.labels else NO_LABEL)
+        return track
+
+    def count_rows(self, track: GraspTrack, rows: Indices, otherwise: str = NO_WINDOW) -> None:
+        """Count the samples in the windows that end in ``rows`` as used, with those that measure the rest level."""
+        for index, (finger, samples) in enumerate(zip(self.fingers, track.fingers, strict=True)):
+            starts = track.newest[rows, index] + 1 - finger.rows
+            used = rows_in_windows(starts, finger.rows, len(samples.t_ns))
+            used[: samples.begin if len(rows) else 0] = True
+            stream = finger.stream if track.recording is None or finger.stream in track.recording.streams else ""
+            count_rows(track.name, stream, RowCounts.from_masks(used, [], otherwise))
 
     def table(self, recording: Recording, finger: Finger) -> pa.Table:
         """Return the columns of a finger in a recording. Raises `TacpipeError` if a stream or column is missing."""
@@ -442,6 +455,7 @@ def read_windows(
     for track in tracks:
         states = track.states(horizon_ns, recovery_ns)
         rows = np.flatnonzero(states != UNCOUNTED)[::stride]
+        reader.count_rows(track, rows)
         parts.append((rows, states[rows]))
     features = [reader.features(track, rows) for track, (rows, _) in zip(tracks, parts, strict=True)]
     owners = np.repeat(np.arange(len(tracks)), [len(rows) for rows, _ in parts])

@@ -14,6 +14,7 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.overview import describe_streams
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins.rows import RowCounts, count_rows
 
 STREAMS = ("cloud", "grasp")
 READING = "reading"
@@ -119,6 +120,8 @@ def _read_geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     except TacpipeError as error:
         raise TacpipeError(f"Recording {shard.name}: {error}") from None
     check(f"Recording {shard.name}", cloud, grasp)
+    for stream, counted in (("grasp", table), ("cloud", points)):
+        count_rows(shard.name, stream, RowCounts.all_used(counted.num_rows))
     return cloud, grasp, int(table.column("t_ns")[0].as_py())
 
 
@@ -134,6 +137,7 @@ def _read_targets(shard: Recording) -> dict[str, Floats]:
             f"Recording {shard.name} has {table.num_rows} readings; a grasp has one. `tacpipe segment grasps` picks the one "
             f"at contact out of a stream."
         )
+    count_rows(shard.name, READING, RowCounts.all_used(1))
     readings = {}
     for target in biotac_sp.TARGETS:
         columns = biotac_sp.columns(target)

@@ -173,6 +173,50 @@ def test_arrays_of_another_length_are_a_stream_of_their_own(tmp_path: Path) -> N
     assert len(result.streams["dq"].column_names) == 15
 
 
+def test_streams_without_stamps_that_have_other_lengths_are_a_note(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["fps"] = 20
+        file["actions"], file["states"] = files.values(200, 7), files.values(250, 9)
+    (result,) = read(tmp_path).values()
+    (note,) = result.notes
+    assert "actions 200 rows; states 250 rows" in note and "20 Hz" in note
+
+
+@pytest.mark.parametrize("fill", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("start_s", [1.7e9, 0.0])
+def test_rows_whose_stamps_were_never_written_are_counted_and_left_out(
+    tmp_path: Path, fill: float, start_s: float
+) -> None:
+    stamps = start_s + np.arange(50) / 8
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_s"], file["x"] = np.where(np.arange(50) < 40, stamps, fill), np.arange(50.0)
+    (result,) = read(tmp_path).values()
+    assert result.streams["x"].column("x").to_pylist() == list(range(40))
+    assert result.streams["x"].column("t_ns").to_pylist()[-1] == int(start_s) * 10**9 + 4_875_000_000
+    assert any("the last 10 of 50 stamps" in note for note in result.notes)
+
+
+def test_stamps_that_end_at_zero_are_stamps(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time_s"], file["x"] = [-2.0, -1.0, 0.0], [1.0, 2.0, 3.0]
+    (result,) = read(tmp_path).values()
+    assert (result.streams["x"].num_rows, list(result.notes)) == (3, [])
+
+
+@pytest.mark.parametrize(
+    ("stamps", "part"),
+    [([1.7e9] * 3, "timestamp is left out: has 3 stamps.*x is left out: has 5 rows, and timestamp 3")]
+    + [
+        ([fill] * 5, r"x is left out: has stamps \(timestamp\) that were never written") for fill in (0.0, float("nan"))
+    ],
+)
+def test_stamps_that_are_not_those_of_the_rows_are_named(tmp_path: Path, stamps: list[float], part: str) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["timestamp"], file["x"] = stamps, np.arange(5.0)
+    with pytest.raises(TacpipeError, match=part):
+        read(tmp_path)
+
+
 def test_nothing_of_another_file_is_read(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "secret.bin", "w") as file:
         file["x"] = np.arange(4.0)

@@ -128,6 +128,44 @@ def test_stamps_that_the_rate_does_not_give_are_read_as_they_are(tmp_path: Path)
     assert "float32" in about(table, "t_ns")["made"]
 
 
+def test_a_rate_that_is_not_that_of_the_timestamps_is_a_note_with_both(tmp_path: Path) -> None:
+    files.write_v2(tmp_path / "pick")
+    path = tmp_path / "pick" / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fps": files.FPS / 2}))
+    notes = {note for result in read(tmp_path).values() for note in result.notes if "fps" in note}
+    assert len(notes) == 1  # a command prints it once for all episodes
+    assert f"{files.FPS / 2:g} fps" in min(notes) and f"{files.FPS} Hz" in min(notes)
+
+
+@pytest.mark.parametrize(
+    ("key", "entry", "part"),
+    [
+        (
+            "observation.state",
+            [0.0, None, *[0.0] * (len(files.NAMES) - 2)],
+            "frame 2, value 1, of observation.state is null",
+        ),
+        ("observation.state", None, "frame 2 of observation.state is null"),
+        ("observation.state", [1.0], "frame 2 of observation.state .* has 1 values, and meta/info.json states"),
+        ("next.reward", None, "frame 2 of next.reward is null"),
+        ("timestamp", None, "frame 2 of timestamp is null"),
+        ("frame_index", None, "frame 2 of frame_index is null"),
+        ("episode_index", None, "episode_index of 1 rows is null"),
+    ],
+)
+def test_a_null_is_named_with_its_frame_and_value(tmp_path: Path, key: str, entry: Any, part: str) -> None:
+    files.write_v2(tmp_path / "pick", episodes=1)
+    path = tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet"
+    table = pq.read_table(path)
+    values = table.column(key).to_pylist()
+    values[2] = entry
+    kind = table.schema.field(key).type
+    kind = pa.list_(kind.value_type) if pa.types.is_fixed_size_list(kind) else kind
+    pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(values, kind)), path)
+    with pytest.raises(TacpipeError, match=part):
+        read(tmp_path)
+
+
 def test_frames_of_hours_keep_the_rate_although_float32_seconds_do_not(tmp_path: Path) -> None:
     files.write_v2(tmp_path / "pick", episodes=1)
     path = tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet"

@@ -65,7 +65,7 @@ def test_tables_and_files_of_labels_are_found(tmp_path: Path) -> None:
         (tmp_path / f"trial_{trial}" / "meta.yaml").write_text("object: cup\n")
     result = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
     sources = labels.find_labels(result, tmp_path, recordings.find_recordings(result, tmp_path))
-    assert sources["trial-1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
+    assert sources["trial_1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
 
 
 def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:

@@ -50,10 +50,10 @@ def counts(ran: Ran) -> tuple[int, int]:
 def test_a_labs_own_tables_become_recordings_with_labels(trial_lab: Lab) -> None:
     trial_lab.run(INGEST)
     result = tacpipe.open("data/rec")
-    assert [entry.name for entry in result] == ["trial-0", "trial-1", "trial-2"]
+    assert [entry.name for entry in result] == ["trial_0", "trial_1", "trial_2"]
     assert [entry.attributes["material"] for entry in result] == ["cork", "felt", "cork"]
     frame = labs.frame(seed=1)
-    assert result["trial-1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
+    assert result["trial_1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
 
 
 def test_what_did_not_change_is_not_read_again(trial_lab: Lab) -> None:
@@ -73,7 +73,7 @@ def test_one_changed_file_costs_one_recording_and_is_not_taken_for_the_same(tria
     trial_lab.run(INGEST)
     labs.frame(seed=7).to_csv(trial_lab.folder / "own" / "trial_2" / "skin.csv", index=False)
     refused = trial_lab.call(INGEST)
-    assert refused.code == 2 and "trial-2" in refused.err
+    assert refused.code == 2 and "trial_2" in refused.err
     assert counts(trial_lab.run(f"{INGEST} --replace --json")) == (1, 2)
 
 
@@ -165,7 +165,7 @@ def test_a_wrong_cell_of_one_recording_of_many_is_named_by_its_line(lab: Lab) ->
     lines[30] = ",".join([str(labs.START_S - 5), *cells[1:]])
     path.write_text("\n".join(lines))
     ran = lab.call(INGEST)
-    assert "row 10 of t01" in ran.err and "t00" not in ran.err
+    assert "t01: own/all.csv, line 31: the stamp is" in ran.err and "t00: read, 20 rows" in ran.err
     assert not list((lab.store.root / "tmp").iterdir())
 
 
@@ -182,7 +182,7 @@ def test_a_wrong_cell_of_one_recording_of_many_is_named_by_its_line(lab: Lab) ->
         (
             lambda folder: (folder / "own/labels.csv").write_text("trial,material\n0,cork\n"),
             1,
-            ("labels.csv", "trial-1"),
+            ("labels.csv", "trial_1"),
         ),
     ],
 )

@@ -337,7 +337,7 @@ def test_a_long_form_of_many_runs_is_the_table_that_pandas_pivots(
         tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', columns)
     )
     expected = rows.pivot(index="time", columns="sensor", values="reading")
-    assert table.column_names == ["t_ns", *rows["sensor"].unique()]
+    assert table.column_names == ["t_ns", *sorted(rows["sensor"].unique())]
     assert table.column("t_ns").to_pylist() == [round(time * 1000) * 10**6 for time in expected.index]
     for name in expected:
         np.testing.assert_array_equal(table.column(name).to_numpy(), expected[name].to_numpy())

@@ -122,7 +122,7 @@ def test_what_the_framer_gives_out_is_sound_or_known_to_be_invisible(sensor: Sen
 def test_a_bit_that_flips_in_a_protocol_without_sum_is_invisible() -> None:
     items, _ = planned(AnySkin(), Faults(flip=3))
     harmed = of_cause(items, "flip")
-    assert sum(item.invisible for item in harmed) > 0.7 * len(harmed)
+    assert sum(item.invisible for item in harmed) > 0.6 * len(harmed)
 
 
 def test_two_bits_that_cancel_out_in_a_sum_are_invisible() -> None:

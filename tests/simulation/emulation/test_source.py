@@ -9,6 +9,7 @@ from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
+from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.biotac import BioTac
 from tacpipe.sensors.camera import Camera
 from tacpipe.sensors.optoforce import OptoForce
@@ -176,6 +177,13 @@ def test_a_board_of_counts_stays_within_its_type() -> None:
     assert counts.dtype == np.uint8
     assert 60 < counts.max() < 255
     assert counts[:20].max() < 10
+
+
+def test_a_magnetometer_sends_multiples_of_its_resolution() -> None:
+    (values,) = SampleSource(AnySkin(), World(1), Timing(100.0)).block(0).values
+    flux = values.reshape(len(values), -1, 4)[..., 1:] / 0.15  # (sample, taxel, axis)
+
+    assert np.abs(flux - np.rint(flux)).max() < 1e-3 and np.abs(flux).max() > 1
 
 
 def test_columns_keep_the_names_of_published_recordings() -> None:

@@ -360,7 +360,9 @@ def test_recordings_of_another_rate_or_grid_are_refused(model: dict[str, bytes])
 
 def test_recordings_of_another_layout_are_refused(model: dict[str, bytes]) -> None:
     fewer = FakeShard("fewer", TEST[0].content.drop_columns(CHANNELS[-3:]))
-    with pytest.raises(TacpipeError, match="fewer: The codec does not fit this table"):
+    with pytest.raises(
+        TacpipeError, match="fewer: The tactile columns differ from those of the first training recording: it lacks"
+    ):
         evaluated(model, fewer)
 
 

@@ -8,7 +8,7 @@ reproduces the messages of a live session bit for bit. docs/explanation/causal.m
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag, auto
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
+from tacpipe.channels.schema import has_arrivals
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.live.decoding import BatchColumns
@@ -28,6 +29,7 @@ from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.signals.resampling import GAP_NS
 from tacpipe.store.records import Step
 from tacpipe.synchronization.causal import Grid, GridRows
+from tacpipe.synchronization.placement import Placement
 from tacpipe.tasks.forward import causal, headline
 from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -53,9 +55,11 @@ class Cause(Flag):
     SKIPPED = auto()  # a later grid point was predicted instead, on request: no forecast
     NO_PLAN = auto()  # no planned motion: the hand is assumed to continue its motion
     PLAN_ENDED = auto()  # the plan ends before the horizon: the hand is assumed to stay at its end
+    TIME = auto()  # the time at which the row was measured is unknown: no forecast
+    MEASURED = auto()  # a newer row arrived together with this one, so what follows is already measured: no forecast
 
 
-BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
+BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED | Cause.TIME | Cause.MEASURED
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,7 @@ class GridForecast:
     """The result at one grid point, which may be that no forecast is possible."""
 
     t_ns: int  # time of the grid point; on a uniform grid, step k is at t_ns + k * period
-    made_from_t_ns: int  # timestamp of the newest sample that was read, at most t_ns; 0 before the streams have started
+    made_from_t_ns: int  # arrival of the newest sample that was read; 0 before the streams have started
     count: Float32s | None  # (horizon, channel), above rest; None if `cause` has a flag of `BLOCKING`
     now: Float32s | None  # (channel,), above rest at t_ns; None before the rest level is known
     cause: Cause
@@ -98,11 +102,12 @@ class _Row(NamedTuple):
     """One row of the grid, before the rest level is subtracted."""
 
     t_ns: int
-    newest_ns: int
+    arrival_ns: int
     tactile: Floats  # (channel,)
     arm: Float32s  # (13,)
     finger_m: float
     gaps: tuple[str, ...]
+    at_arrival: bool  # True if the sampling time is unknown
 
 
 class LiveChain:
@@ -122,6 +127,7 @@ class LiveChain:
         targets: Targets | None = None,
         quantiles: Sequence[int] = (),
         cameras: Mapping[str, LiveChannels | None] | None = None,
+        arrivals: Collection[str] = (),
     ) -> None:
         """Create a chain from compatible parts; `for_model` checks them."""
         self._targets = targets
@@ -134,6 +140,8 @@ class LiveChain:
         sync = stages.synchronize
         gap_ns = {stream: round(_gap_ms(sync, forecaster, stream) * 1e6) for stream in layout.readings}
         origin_ns = None if beginning is None else beginning.origin_ns
+        self._arrivals = set(arrivals)
+        self._placements: dict[str, Placement] = {}
         self._grid = Grid(layout.readings, layout.master, sync.timeline, sync.rate_hz, gap_ns, origin_ns)
         if beginning is not None:
             for stream, levels in layout.levels(beginning.rest).items():
@@ -143,6 +151,7 @@ class LiveChain:
         # rows collected until the rest level is known; None afterwards
         self._resting: list[_Row] | None = [] if beginning is None else None
         self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
+        self._rest_rows = "unknown" if beginning is None else "of an earlier process"
         self._plans = PlanHistory()
         self._late_plans = 0
         self._until_ns: int | None = None
@@ -164,6 +173,7 @@ class LiveChain:
         quantiles: Sequence[int] = (),
         *,
         allow_look_ahead: bool = False,
+        arrivals: Collection[str] = (),
     ) -> LiveChain:
         """Return the chain of a model, from its files, its preprocessing stages, and the schema of each recorded stream.
 
@@ -183,6 +193,8 @@ class LiveChain:
 
         ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` if the model does not have them.
 
+        ``arrivals`` are the streams whose times are arrivals although their schemas do not state it.
+
         Raises `TacpipeError` for a model that was trained on rows that look ahead, unless ``allow_look_ahead``.
         """
         forecaster = model if isinstance(model, Forecaster) else Forecaster.load(model)
@@ -201,7 +213,7 @@ class LiveChain:
         read_layouts = {**layouts, **{name: camera.schema for name, camera in cameras.items()}}
         layout = InputLayout.for_forecaster(forecaster, stages.synchronize, read_layouts, master)
         known = cameras if beginning is None else dict.fromkeys(cameras)
-        return cls(forecaster, steps, layout, beginning, targets, quantiles, known)
+        return cls(forecaster, steps, layout, beginning, targets, quantiles, known, arrivals)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -274,6 +286,11 @@ class LiveChain:
         return None if self._rest is None or origin_ns is None else Beginning(origin_ns, tuple(self._rest.tolist()))
 
     @property
+    def rest_rows(self) -> str:
+        """The rows that gave the level at rest, in words."""
+        return self._rest_rows
+
+    @property
     def late(self) -> Mapping[str, int]:
         """The number of late samples by stream, which arrived after a newer sample or after `advance` passed their time.
 
@@ -294,7 +311,12 @@ class LiveChain:
                 if camera is None:
                     return
                 samples = camera.push(batch)
-            self._grid.push(stream, *self._layout.samples(stream, samples))
+            placement = self._placements.get(stream)
+            if placement is None:  # the first samples show whether a stream has a device clock
+                is_arrival = stream in self._arrivals or has_arrivals(samples.schema.field("t_ns"))
+                placement = self._placements[stream] = Placement(samples.schema, arrivals=is_arrival)
+            times, values = self._layout.samples(stream, samples, placement.columns)
+            self._grid.push(stream, *placement.place(times), values)
 
     def continue_cameras(self, previous: LiveChain) -> None:
         """Continue the channels of the cameras of an earlier chain of the session, which know the untouched gels."""
@@ -322,50 +344,59 @@ class LiveChain:
         forecasts: list[GridForecast] = []
         if not len(rows.t_ns):
             return forecasts
+        arrived_with_next = np.append(np.diff(rows.arrival_ns) == 0, False)  # (row,)
         with one_thread():
             for index, at_ns in enumerate(rows.t_ns.tolist()):
                 if not rows.has_samples[index]:
                     forecasts.append(GridForecast(at_ns, 0, None, None, Cause.START))
                     continue
-                row = self._row(rows, index, at_ns)
-                skipped = newest_only and index < len(rows.t_ns) - 1
-                forecasts.append(self._forecast(row, skipped=skipped))
+                row = self._row(rows, index)
+                cause = Cause.MEASURED if arrived_with_next[index] else Cause.NONE
+                if newest_only and index < len(rows.t_ns) - 1:
+                    cause = Cause.SKIPPED
+                forecasts.append(self._forecast(row, cause))
         return forecasts
 
-    def _row(self, rows: GridRows, index: int, t_ns: int) -> _Row:
+    def _row(self, rows: GridRows, index: int) -> _Row:
         """Return the row ``index`` of the grid, in the form that the model reads."""
+        t_ns, arrival_ns = int(rows.t_ns[index]), int(rows.arrival_ns[index])
         gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
-        newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
         values = {name: columns[index] for name, columns in rows.values.items()}
         layout = self._layout
         arm = self._arm.row(t_ns, *layout.arm_state(values))
-        return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
+        at_arrival = bool(rows.at_arrival[index])
+        return _Row(t_ns, arrival_ns, layout.tactile(values), arm, layout.finger_m(values), gaps, at_arrival)
 
-    def _forecast(self, row: _Row, *, skipped: bool) -> GridForecast:
-        """Add a row and return its forecast, which has no values until the rest level is known and the window is full."""
+    def _forecast(self, row: _Row, unneeded: Cause) -> GridForecast:
+        """Add a row and return its forecast, which has no values until the rest level is known and the window is full.
+
+        ``unneeded`` is the cause for which the row is not predicted although it could be, or NONE.
+        """
         if self._resting is not None:
-            first = self._resting[0] if self._resting else row
-            if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
+            first_ns = next((resting.t_ns for resting in self._resting if not resting.at_arrival), None)
+            if first_ns is None or row.t_ns <= first_ns + round(self._stages.contacts.rest_s * 1e9):
                 self._resting.append(row)
-                return GridForecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
-            self._rest = self._layout.rest_levels(
-                self._stages.contacts, [resting_row.tactile for resting_row in self._resting]
-            )
-            for resting_row in self._resting:
-                self._take(resting_row)
+                return GridForecast(row.t_ns, row.arrival_ns, None, None, Cause.START, row.gaps)
+            at_rest = [resting for resting in self._resting if not resting.at_arrival]
+            self._rest = self._layout.rest_levels(self._stages.contacts, [resting.tactile for resting in at_rest])
+            rest_s = (at_rest[-1].t_ns - at_rest[0].t_ns) / 1e9
+            self._rest_rows = f"{len(at_rest)} rows over {rest_s:.3f} s"
+            for resting in self._resting:
+                self._take(resting)
             self._resting = None
         finite = self._take(row)
         cause = Cause.GAP if row.gaps else Cause.NONE
+        cause |= Cause.TIME if row.at_arrival else Cause.NONE
         cause |= Cause.NONE if finite else Cause.VALUE
         cause |= Cause.NONE if cause or self._rolling.is_ready else Cause.CONTEXT
-        cause |= Cause.SKIPPED if skipped and not cause else Cause.NONE
+        cause |= Cause.NONE if cause else unneeded
         now = self._rolling.now.astype(np.float32)
         if cause:
-            return GridForecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
-        ahead, lacking = self._planned_rows(row.t_ns)
+            return GridForecast(row.t_ns, row.arrival_ns, None, now, cause, row.gaps)
+        ahead, lacking = self._planned_rows(row)
         count = self._rolling.predict(ahead)
         quantiles = self._rolling.quantiles(ahead, count)[..., self._quantiles] if self._quantiles else None
-        return GridForecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=quantiles)
+        return GridForecast(row.t_ns, row.arrival_ns, count, now, lacking, quantiles=quantiles)
 
     def _take(self, row: _Row) -> bool:
         """Add a row to the model's window; return whether its values are finite."""
@@ -378,24 +409,24 @@ class LiveChain:
             row.finger_m,
             follows=since_ns is not None and since_ns <= self._apart_ns,
             encodes=since_ns is not None and since_ns <= self._codec_ns,
-            usable=not row.gaps,
+            usable=not row.gaps and not row.at_arrival,
         )
 
-    def _planned_rows(self, t_ns: int) -> tuple[AnyFloats, Cause]:
+    def _planned_rows(self, row: _Row) -> tuple[AnyFloats, Cause]:
         """Return the arm's planned rows (horizon, 13), and the cause if the plan is missing or too short, else NONE."""
-        now, ahead_ns = self._rolling.arm, t_ns + self._steps_ns()
+        now, ahead_ns = self._rolling.arm, row.t_ns + self._steps_ns()
         if not self.reads_plan:  # a model without plans uses the newest row instead
             return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE
         if self._targets is not None:
-            aimed = self._targets.state(t_ns)
+            aimed = self._targets.state(row.arrival_ns)
             cause = Cause.NO_PLAN if aimed is None else Cause.NONE
-            return causal.extrapolate_arm(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
-        self._plans.forget_before(t_ns)
-        plan = self._plans.newest(t_ns)
+            return causal.extrapolate_arm(row.t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
+        self._plans.forget_before(row.arrival_ns)
+        plan = self._plans.newest(row.arrival_ns)
         if plan is None:
-            return causal.extrapolate_arm(t_ns, ahead_ns, now), Cause.NO_PLAN
+            return causal.extrapolate_arm(row.t_ns, ahead_ns, now), Cause.NO_PLAN
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
-        return causal.rows(plan, t_ns, ahead_ns, now), cause
+        return causal.rows(plan, row.t_ns, ahead_ns, now), cause
 
     def _steps_ns(self) -> Times:
         """Return the times of the predicted rows relative to the newest one (horizon,).

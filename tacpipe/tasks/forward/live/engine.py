@@ -34,6 +34,9 @@ SLACK_NS = 5_000_000  # additional time that is allowed for jitter
 EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
 LITTLE_NS = 300_000  # minimum wait for which the process sleeps instead of polling
 STARTING_S = 0.005  # wait between two attempts while the grid is unknown
+# Until the rest level is known, rows wait this long for samples that other threads have read but not passed yet: one that
+# is missing would change the level of the whole session.
+RESTING_NS = 250_000_000
 
 
 class CausalChain(Protocol):
@@ -75,6 +78,10 @@ class CausalChain(Protocol):
     def beginning(self) -> Beginning | None:
         """The state that a chain needs to continue the session; None until it is known."""
 
+    @property
+    def rest_rows(self) -> str:
+        """The rows that gave the level at rest, in words."""
+
     def push(self, stream: str, batch: Any) -> None:
         """Add samples of a stream."""
 
@@ -106,6 +113,7 @@ class ForecastEngine(Engine):
         Without ``steps`` all steps are published.
         """
         super().__init__(sensors, settle_ns)
+        self.resting_ns = RESTING_NS
         self._open_chain = opened
         self.quantiles = tuple(quantiles)
         self.chain = opened({name: likely_schema(sensor) for name, sensor in self.sensors.items()}, None)
@@ -128,6 +136,13 @@ class ForecastEngine(Engine):
     def late(self) -> int:
         """The number of samples so far that arrived after their row was computed."""
         return self._late + sum(self.chain.late.values())
+
+    @property
+    def states(self) -> dict[str, str]:
+        """The rows that gave the level at rest, and the numbers of late samples by stream."""
+        states = {} if self.chain.beginning is None else {"level at rest": self.chain.rest_rows}
+        late = ", ".join(f"{name} {count}" for name, count in self.chain.late.items() if count)
+        return {**states, **({"late": late} if late else {})}
 
     @property
     def beginning(self) -> Beginning | None:
@@ -198,15 +213,21 @@ class ForecastEngine(Engine):
         if self._offset_ns is None or len(self._begun) < len(self.sensors):
             return []
         began_s = time.perf_counter()
-        until_ns = now_ns - self.settle_ns
+        is_resting = self.chain.beginning is None and self.resting_ns > self.settle_ns
+        until_ns = now_ns - (self.resting_ns if is_resting else self.settle_ns)
         row_ns = self._row_ns
         self._decode(self._offset_ns, until_ns if row_ns is not None and row_ns <= now_ns else None)
         forecasts = self.chain.advance(until_ns + self._offset_ns, newest_only=True)
+        if is_resting and self.chain.beginning is not None:  # the newest row is due, not the one that ended the wait
+            self._decode(self._offset_ns, None)
+            newest_ns = now_ns - self.settle_ns + self._offset_ns
+            forecasts = self.chain.advance(newest_ns, newest_only=True) or forecasts
         if not forecasts:
             return self._silence(now_ns)
         self._why = ""
         self._point_ns, self._last_ns = forecasts[-1].t_ns, now_ns
-        self.skipped += sum(Cause.SKIPPED in forecast.cause for forecast in forecasts)
+        if not is_resting:  # rows that waited for the rest level are no sign of overload
+            self.skipped += sum(Cause.SKIPPED in forecast.cause for forecast in forecasts)
         message = self._message(forecasts[-1], now_ns)
         message.late, message.compute_ms = self.late, (time.perf_counter() - began_s) * 1e3
         return [message]
@@ -311,6 +332,7 @@ def describe_cause(forecast: GridForecast) -> str:
 SENTENCES = {
     Cause.START: "the session begins: the level at rest is not known yet",
     Cause.VALUE: "a value is not finite",
+    Cause.TIME: "it is not known when the newest row was measured",
     Cause.CONTEXT: "the model's context is being filled",
     Cause.PLAN_ENDED: "the plan has ended: the hand is taken to stay",
     Cause.NO_PLAN: "there is no plan: the hand is taken to move on",

@@ -158,27 +158,32 @@ class InputLayout:
             poses.metres_per_unit(grid.field(opening)) if opening else 1.0,
         )
 
-    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns) -> tuple[Times, Floats]:
-        """Return timestamps (time,) and the required columns (time, column) of a batch of a stream.
+    def samples(
+        self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns, times: Sequence[str]
+    ) -> tuple[dict[str, Times], Floats]:
+        """Return the columns ``times`` (time,) by name and the required columns (time, column) of a batch of a stream.
 
         Raises `TacpipeError` if a column is missing.
         """
         place = self._places.get(stream)
         if place is None or place[0] is not batch.schema:
             names = batch.schema.names
-            absent = [name for name in ("t_ns", *self.columns[stream]) if name not in names]
+            absent = [name for name in (*times, *self.columns[stream]) if name not in names]
             if absent:
                 raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
-            place = (batch.schema, tuple(names.index(name) for name in ("t_ns", *self.columns[stream])))
+            place = (batch.schema, tuple(names.index(name) for name in (*times, *self.columns[stream])))
             self._places[stream] = place
-        time_column, *value_columns = place[1]
-        t_ns = _array(batch.column(time_column)).astype(np.int64, copy=False)
+        time_columns, value_columns = place[1][: len(times)], place[1][len(times) :]
+        stamps = {
+            name: _array(batch.column(number)).astype(np.int64, copy=False)
+            for name, number in zip(times, time_columns, strict=True)
+        }
         if isinstance(batch, BatchColumns):
-            return t_ns, batch.columns_of(tuple(value_columns))
+            return stamps, batch.columns_of(tuple(value_columns))
         values = np.empty((batch.num_rows, len(value_columns)))
         for index, number in enumerate(value_columns):
             values[:, index] = _array(batch.column(number))
-        return t_ns, values
+        return stamps, values
 
     def tactile(self, values: Mapping[str, Floats]) -> Floats:
         """Return the tactile channels (channel,) of a row, given as ``values`` (column,) by stream."""

@@ -15,6 +15,7 @@ from tacpipe.live.stages import extracted_streams, streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.store.records import Step
+from tacpipe.synchronization.placement import are_arrivals
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, GridForecast, LiveChain
 from tacpipe.tasks.forward.prediction import check_steps, prediction_table
@@ -101,7 +102,7 @@ def _predict_recording(
         dict(zip(quantiles, all_bands.transpose(3, 1, 2, 0).copy(), strict=True)),
     )
     described = {f"forecast_{_name(cause)}": causes[cause] for cause in sorted(causes, key=lambda cause: cause.value)}
-    return RecordingOutput(table, {"causal": True, **described}), causes
+    return RecordingOutput(table, {"causal": True, "level_at_rest": chain.rest_rows, **described}), causes
 
 
 def build_chain(
@@ -119,6 +120,11 @@ def build_chain(
     `LiveChain.for_model`.
     """
     schemas = {name: table.schema for name, table in tables.items()}
+    arrivals = [
+        name
+        for name, table in tables.items()
+        if table.num_rows and are_arrivals(table.schema.field("t_ns"), recording.attributes, equal_fraction(table))
+    ]
     plan = str(recording.attributes.get("live_plan", ""))
     stream = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     return LiveChain.for_model(
@@ -129,19 +135,28 @@ def build_chain(
         plan_from=stream if stream in schemas else "",
         quantiles=quantiles,
         allow_look_ahead=allow_look_ahead,
+        arrivals=arrivals,
     )
 
 
+def equal_fraction(table: pa.Table) -> float:
+    """Return the fraction of stamps of a stream that equal the previous one."""
+    return float((np.diff(table.column("t_ns").to_numpy()) == 0).sum() / table.num_rows)
+
+
 def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
-    """Yield the forecasts of a recording, whose samples are passed to ``chain`` in chunks, in the order of arrival."""
+    """Yield the forecasts of a recording up to the master's last sample.
+
+    Samples are passed to ``chain`` in chunks, in the order of arrival.
+    """
     stamps = {
         name: tables[name].column("t_ns").to_numpy()
         for name in (*chain.streams, PLAN)
         if name in tables and tables[name].num_rows
     }
-    if not stamps:
+    if chain.master not in stamps:
         return
-    begins, last = (int(pick(stream_ns[end] for stream_ns in stamps.values())) for pick, end in ((min, 0), (max, -1)))
+    begins, last = min(int(stream_ns[0]) for stream_ns in stamps.values()), int(stamps[chain.master][-1])
     rows = dict.fromkeys(stamps, 0)
     for until_ns in (*range(begins, last, PIECE_NS), last):
         for name, t_ns in stamps.items():
