@@ -43,6 +43,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "ingest table tables --layout tables/layout.toml -o {o}",
     "ingest table tables --guess",
     "ingest lerobot sets -o {o}",
+    "check data/recordings",
     "export csv data/recordings -o {o}",
     "export card data/recordings -o {o}",
     "export lerobot data/recordings --rate-hz 20 -o {o}",
