@@ -7,7 +7,6 @@ Example: tacpipe extract markers data/recordings -o data/markers
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -56,7 +55,7 @@ class Params(StreamSelection):
             )
 
 
-@stage(version=1)
+@stage(version=2)
 def difference(params: Params, recording: Recording) -> RecordingOutput:
     """Measure how the brightness of a gel changes on a grid.
 
@@ -75,7 +74,7 @@ def difference(params: Params, recording: Recording) -> RecordingOutput:
                 f"{subject}: frames have {video_format.width_px} x {video_format.height_px} pixels, and the grid "
                 f"{params.columns} x {params.rows} cells. Choose fewer with --columns and --rows."
             )
-        channels = DifferenceChannels(params.rows, params.columns, params.reference_frames)
+        channels = DifferenceChannels(params.rows, params.columns, params.reference_frames, subject)
         return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
@@ -98,7 +97,7 @@ class MarkerParams(StreamSelection):
             )
 
 
-@stage(version=1)
+@stage(version=2)
 def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     """Track the markers of a gel as tactile channels.
 
@@ -132,7 +131,7 @@ class FrameAutoencoderParams(StreamSelection):
     seed: Seed = 0  # random seed of initial weights and of the order of images
 
 
-@stage(version=1)
+@stage(version=2)
 def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: Workspace) -> Result:
     """Return the weights of an encoder trained on images of the training recordings.
 
@@ -161,7 +160,7 @@ def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: W
     return Result(files={frame_autoencoder.WEIGHTS: weights})
 
 
-@stage(version=1, fit=fit_autoencoder)
+@stage(version=2, fit=fit_autoencoder)
 def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fitted) -> RecordingOutput:
     """Encode frames with a small convolutional autoencoder.
 
@@ -202,7 +201,7 @@ class EncoderParams(StreamSelection):
         object.__setattr__(self, "weights_sha256", digest)
 
 
-@stage(version=1)
+@stage(version=2)
 def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
     """Encode frames with an image encoder from a weights file.
 
@@ -224,12 +223,14 @@ def _replace_frames(
 ) -> RecordingOutput:
     """Return a recording with its streams of frames replaced by the streams that ``compute`` returns.
 
-    The first argument of ``compute`` names recording and stream for errors. Raises `TacpipeError` if no stream has frames.
+    Rows of damaged frames are null, counted and noted. The first argument of ``compute`` names recording and stream for
+    errors. Raises `TacpipeError` if no stream has frames.
     """
     from tacpipe.video.stream import read_format
 
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
     rows: dict[str, RowCounts] = {}
+    notes: list[str] = []
     has_frames = False
     for name in recording.streams:
         columns = recording.columns(name)
@@ -239,27 +240,37 @@ def _replace_frames(
         else:
             has_frames = True
             values = compute(f"Recording {recording.name}, stream {name}", columns, video_format)
-            streams[name] = _count_frames(values, columns, functools.partial(rows.__setitem__, name))
+            streams[name] = _count_frames(values, columns, name, rows, notes)
     if not has_frames:
         raise TacpipeError(
             f"Recording {recording.name} has no stream of frames; its streams are {', '.join(recording.streams)}. Give the "
             f"recording of a camera, as `tacpipe ingest` or `tacpipe acquire` wrote it."
         )
-    return RecordingOutput(streams, rows=rows)
+    return RecordingOutput(streams, notes=notes, rows=rows)
 
 
 def _count_frames(
-    values: pa.RecordBatchReader, columns: Columns, state: Callable[[RowCounts], None]
+    values: pa.RecordBatchReader, columns: Columns, stream: str, rows: dict[str, RowCounts], notes: list[str]
 ) -> pa.RecordBatchReader:
-    """Return the values computed from frames; when they are read, ``state`` gets the counts of the frames' rows."""
+    """Return the values computed from frames. When they are read, the frames are counted in ``rows`` and ``notes``.
+
+    The values of a damaged frame are null.
+    """
     import pyarrow as pa
 
+    from tacpipe.video.stream import describe_damage
+
     def batches() -> Iterator[pa.RecordBatch]:
-        used = 0
+        damaged = [np.zeros(0, bool)]  # (frame,) by batch
         for batch in values:
-            used += batch.num_rows
+            damaged.append(batch.column(batch.num_columns - 1).is_null().to_numpy(zero_copy_only=False))
             yield batch
-        state(RowCounts.some_used(columns.num_rows, used, "without an image"))
+        is_damaged = np.concatenate(damaged)
+        without_image = columns.num_rows - len(is_damaged)
+        unused = {"damaged": int(is_damaged.sum()), "without an image": without_image}
+        rows[stream] = RowCounts(columns.num_rows, columns.num_rows - sum(unused.values()), unused)
+        if is_damaged.any():
+            notes.append(f"Stream {stream}: {describe_damage(is_damaged)}. Their rows are null.")
 
     return pa.RecordBatchReader.from_batches(values.schema, batches())
 
@@ -273,9 +284,12 @@ def _copy_stream(columns: Columns) -> pa.RecordBatchReader:
 
 
 def _stream_of_values(
-    columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats]]
+    columns: Columns, fields: list[pa.Field], values: Iterator[tuple[int, AnyFloats | None]]
 ) -> pa.RecordBatchReader:
-    """Return a lazy stream with the clocks of ``columns`` and ``values``, an iterator of row index and values (field,)."""
+    """Return a lazy stream with the clocks of ``columns`` and ``values``, an iterator of row index and values (field,).
+
+    Rows whose values are None are null.
+    """
     import pyarrow as pa
 
     from tacpipe.video.channels import CLOCKS
@@ -288,7 +302,10 @@ def _stream_of_values(
     def batches() -> Iterator[pa.RecordBatch]:
         for block in _blocks(values, BATCH_ROWS):
             times = clocks.take([row for row, _ in block]).combine_chunks()
-            channels = np.array([row_values for _, row_values in block], np.float32)  # (time, field)
+            channels = np.full((len(block), len(fields)), np.nan, np.float32)  # (time, field)
+            for position, (_, row_values) in enumerate(block):
+                if row_values is not None:
+                    channels[position] = row_values
             arrays = [pa.array(channel, from_pandas=True) for channel in channels.T]  # NaN is null
             clock_arrays = [times.column(name).chunk(0) for name in clock_names]
             yield pa.RecordBatch.from_arrays([*clock_arrays, *arrays], schema=schema)
@@ -298,12 +315,16 @@ def _stream_of_values(
 
 def _channel_values(
     columns: Columns, video_format: VideoFormat, channels: FrameChannels
-) -> Iterator[tuple[int, AnyFloats]]:
-    """Yield the row index and the channels (field,) of each frame."""
+) -> Iterator[tuple[int, AnyFloats | None]]:
+    """Yield the row index and the channels (field,) of each frame, None for a damaged one."""
     from tacpipe.video.decoding import decode_frames, read_batches
 
     for row, image in decode_frames(video_format, read_batches(columns), grey=channels.grey):
-        yield row, channels.values(image)
+        if image is None:
+            channels.skip()
+            yield row, None
+        else:
+            yield row, channels.values(image)
 
 
 def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[int, T]]]:
@@ -335,8 +356,8 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
         reduced: list[Bytes] = []
         for stream, columns, video_format in frame_streams:
             frames, before = decode_frames(video_format, read_batches(columns)), len(reduced)
-            reduced += [reduce_image(image) for row, image in frames if row % step == 0]
-            counts = RowCounts.some_used(columns.num_rows, len(reduced) - before, "not sampled")
+            reduced += [reduce_image(image) for row, image in frames if row % step == 0 and image is not None]
+            counts = RowCounts.some_used(columns.num_rows, len(reduced) - before, "not sampled or damaged")
             count_rows(recording.name, stream, counts)
         if frame_streams:
             images.append(np.array(reduced, np.uint8))
@@ -350,9 +371,12 @@ def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode)
     """
     from tacpipe.video.decoding import decode_frames, read_batches
 
-    def features() -> Iterator[tuple[int, AnyFloats]]:
+    def features() -> Iterator[tuple[int, AnyFloats | None]]:
         for block in _blocks(decode_frames(video_format, read_batches(columns)), ENCODED_FRAMES):
-            images = [image for _, image in block]
+            images = [image for _, image in block if image is not None]
+            if not images:
+                yield from ((row, None) for row, _ in block)
+                continue
             # all batches have the same size, because the rounding of a matrix product depends on its number of rows
             images += images[-1:] * (ENCODED_FRAMES - len(images))
             encoded = encode(np.stack(images))
@@ -361,12 +385,23 @@ def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode)
                     f"The encoder returned an array of the shape {encoded.shape} for {ENCODED_FRAMES} frames. It must "
                     f"return one row of features per frame."
                 )
-            yield from zip((row for row, _ in block), encoded, strict=False)
+            codes = iter(encoded)
+            yield from ((row, None if image is None else next(codes)) for row, image in block)
 
     values = features()
-    head = list(itertools.islice(values, 1))
-    width = len(head[0][1]) if head else 0
+    head = list(_until_sound(values))
+    width = next((len(row_values) for _, row_values in reversed(head) if row_values is not None), 0)
+    if head and not width:
+        raise TacpipeError("None of its frames can be decoded. Leave the recording out with --skip-bad.")
     return _stream_of_values(columns, _feature_fields(width), itertools.chain(head, values))
+
+
+def _until_sound(values: Iterator[tuple[int, T | None]]) -> Iterator[tuple[int, T | None]]:
+    """Yield values up to and including the first that is not None."""
+    for row, row_values in values:
+        yield row, row_values
+        if row_values is not None:
+            return
 
 
 def _feature_fields(count: int) -> list[pa.Field]:

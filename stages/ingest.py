@@ -22,7 +22,7 @@ from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table.contained import ContainerCommand, Params
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values, stage
-from tacpipe.plugins.stream_selection import StreamSelection
+from tacpipe.plugins.video_checks import VideoChecks, check_videos
 
 ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), ContainerCommand("hdf5")
 XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
@@ -77,8 +77,19 @@ def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     return XDF.read(params, files, values)
 
 
-@LEROBOT.stage(version=3)
-def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
+@dataclass(frozen=True)
+class LeRobotParams(VideoChecks, Params):
+    """Settings that datasets do not state."""
+
+
+def preview_lerobot(params: LeRobotParams, source: Path) -> str:
+    """Describe the streams that would be read from LeRobot datasets."""
+    with check_videos(params):
+        return LEROBOT.preview(params, source)
+
+
+@LEROBOT.stage(version=4, preview=preview_lerobot)
+def lerobot(params: LeRobotParams, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
 
     An episode is a recording, a feature a stream, and the task a label. Stamps are frame_index / fps if the timestamps
@@ -86,7 +97,8 @@ def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
 
     Example: tacpipe ingest lerobot datasets/pusht -o data/recordings
     """
-    return LEROBOT.read(params, files, values)
+    with check_videos(params):
+        return LEROBOT.read(params, files, values)
 
 
 @dataclass(frozen=True)
@@ -121,7 +133,7 @@ def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
 
 
 @dataclass(frozen=True)
-class TableParams(StreamSelection):
+class TableParams(VideoChecks):
     """Layout of the tables."""
 
     layout: Annotated[str, TomlFile()] = ""  # layout file; docs/reference/layout.md describes its entries
@@ -174,4 +186,5 @@ def table(params: TableParams, files: Files, values: Values, shared: Shared | No
 
     Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
     """
-    return contained.read_recording(params.parsed(), None, files, values, shared)
+    with check_videos(params):
+        return contained.read_recording(params.parsed(), None, files, values, shared)

@@ -51,12 +51,13 @@ class StreamFigures(TypedDict, total=False):
     gap_shares: dict[str, float]
     held_share: float
     saturated: int
-    codec: str  # this field and the next five exist only for streams of frames
+    codec: str  # this field and those after it exist only for streams of frames
     width_px: int
     height_px: int
     pixel_format: str
     nominal_rate_hz: float | None
     missing_frames: int | None
+    damaged_frames: int
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
     """Return the figures of a stream; ``clocks`` are its clocks, or None if it has no times."""
     import pyarrow as pa
 
-    from tacpipe.video.stream import read_format
+    from tacpipe.video.stream import DAMAGED, read_format
 
     figures: StreamFigures = {"rows": columns.num_rows, "columns": len(columns.column_names)}
     if clocks is not None:
@@ -234,6 +235,8 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
         rate_hz = video_format.nominal_rate_hz
         figures["nominal_rate_hz"] = None if rate_hz is None else round(float(rate_hz), 3)
         figures["missing_frames"] = _missing_frames(columns)
+        if DAMAGED in columns.column_names:
+            figures["damaged_frames"] = int(columns.column(DAMAGED).to_numpy().sum())
     tactile = [field.name for field in columns.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
     integers = [name for name in tactile if pa.types.is_integer(columns.schema.field(name).type)]
     if integers and columns.num_rows > 1:
@@ -334,6 +337,8 @@ def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
         parts += [f"{plain(figures['pixel_format'])}"] * bool(figures["pixel_format"])
         parts.append("no common rate" if rate is None else f"{rate:g} frames/s")
         parts.append("missing frames unknown" if missing is None else f"{format_count(missing, 'missing frames')}")
+        if damaged := figures.get("damaged_frames"):
+            parts.append(f"{format_count(damaged, 'damaged frames')}")
         lines.append(f"  {shown(stream) or '-'}: {', '.join(parts)}")
     return "\n".join(["video", *lines]) if lines else ""
 

@@ -171,7 +171,7 @@ def _write_recording(params: Params, recording: Recording, losses: list[Loss], c
 
 
 def _write_images(group: h5py.Group, columns: Columns) -> None:
-    """Write the decoded frames of a stream of frames, one chunk per frame; rows without a frame are black."""
+    """Write the decoded frames of a stream of frames, one chunk per frame; rows without a sound frame are black."""
     from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import PACKET, read_format
 
@@ -184,7 +184,8 @@ def _write_images(group: h5py.Group, columns: Columns) -> None:
     )
     dataset.attrs[DERIVED] = PACKET  # `tacpipe ingest hdf5` reads the packets, and no second stream
     for row, image in decode_frames(video_format, read_batches(columns)):
-        dataset[row] = image
+        if image is not None:
+            dataset[row] = image
 
 
 def _write_attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:

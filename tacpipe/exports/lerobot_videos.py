@@ -10,6 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -23,6 +24,7 @@ from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
 from tacpipe.video.stream import (
     BATCH_ROWS,
+    DAMAGED,
     DTS,
     KEY_FRAME,
     PACKET,
@@ -124,7 +126,7 @@ def nearest_rows(columns: Columns, synchronized: Columns) -> Int64s:
 
 
 def images_of_rows(columns: Columns, rows: Int64s) -> Iterator[Bytes]:
-    """Yield the image of each of the ascending ``rows``; a row without an image has the last one, or a black one."""
+    """Yield the image of each of the ascending ``rows``; a row without a sound image has the last one, or a black one."""
     from tacpipe.video.decoding import decode_frames, read_batches
 
     video_format = VideoFormat.from_metadata(columns.schema.field(PACKET).metadata)
@@ -134,7 +136,7 @@ def images_of_rows(columns: Columns, rows: Int64s) -> Iterator[Bytes]:
     following = next(frames, None)
     for row in rows.tolist():
         while following is not None and start + following[0] <= row:
-            latest = following[1]
+            latest = latest if following[1] is None else following[1]
             following = next(frames, None)
         yield latest
 
@@ -177,6 +179,10 @@ class EpisodeVideo:
 
     def losses(self, stream: str, ending: str) -> Iterator[Loss]:
         """Yield the losses of the stream in the video; ``ending`` completes each reason."""
+        if DAMAGED in self.columns.column_names and not self.is_copied:
+            damaged = int(np.count_nonzero(self.columns.column(DAMAGED).to_numpy(zero_copy_only=False)[self.rows]))
+            if damaged:
+                yield Loss(f"{damaged:,} damaged frames: each has the image of the sound one before it{ending}", stream)
         if not self.is_copied:
             yield Loss(f"its packets: frames are encoded as {self.codec.upper()}, with some loss{ending}", stream)
         if len(np.unique(self.rows)) < self.columns.num_rows or (np.diff(self.rows) == 0).any():
@@ -229,7 +235,8 @@ class EpisodeVideo:
         for number, image in enumerate(images_of_rows(self.columns, self.rows)):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = self._tick(number), Fraction(1, TICKS)
-            container.mux(stream.encode(frame))
+            with _unchanged_priority():
+                container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
 
     def _tick(self, number: int) -> int:
@@ -241,13 +248,27 @@ class EpisodeVideo:
         from tacpipe.video.decoding import read_frames
 
         sampled_rows = np.unique(np.linspace(0, len(self.rows) - 1, SAMPLED).round().astype(int))
-        images = list(read_frames(self.columns, self.rows[sampled_rows].tolist()).values())
+        black: Bytes = np.zeros((1, 1, 3), np.uint8)  # if no sampled frame is sound
+        images = list(read_frames(self.columns, self.rows[sampled_rows].tolist()).values()) or [black]
         pixels: Floats = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image in images)]) / 255
         values = {
             **{"min": pixels.min(0), "max": pixels.max(0), "mean": pixels.mean(0), "std": pixels.std(0)},
             **dict(zip(COLOUR_QUANTILES, np.quantile(pixels, list(COLOUR_QUANTILES.values()), axis=0), strict=True)),
         }
         return {**{key: value.reshape(3, 1, 1).tolist() for key, value in values.items()}, "count": [len(images)]}
+
+
+@contextmanager
+def _unchanged_priority() -> Iterator[None]:
+    """Keep the scheduling of this process: run as root, SVT-AV1 moves it before all other programs, a recording included."""
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        if os.sched_getscheduler(0) != policy:
+            for thread in Path("/proc/self/task").iterdir():
+                with suppress(OSError):  # the thread may have ended
+                    os.sched_setscheduler(int(thread.name), policy, parameters)
 
 
 def combine_statistics(episodes: Sequence[Mapping[str, list[Any]]]) -> dict[str, list[Any]]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.formats.published import by_object, published_attribute, require
 from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
-from tacpipe.plugins.stream_selection import StreamSelection
+from tacpipe.plugins.video_checks import VideoChecks, check_videos
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,7 +26,7 @@ NAMES = (*VIDEOS, SLIP)
 
 
 @dataclass(frozen=True)
-class Params(StreamSelection):
+class Params(VideoChecks):
     """How trials are read."""
 
 
@@ -40,7 +40,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return by_object(source, NAMES, "trial", example="lemon", described=tuple(VIDEOS), prefix="exp_num_")
 
 
-@stage(version=1, discover=discover)
+@stage(version=2, discover=discover)
 def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     """Read published videos of two GelSight Mini, with slip.
 
@@ -52,9 +52,12 @@ def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     trial_files = {Path(name).name: path for name, path in files.items()}
     require(trial_files, tuple(VIDEOS))
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
-    for name, stream in VIDEOS.items():
-        frames = scan(trial_files[name])
-        streams[stream] = read_stream(trial_files[name], frames, frames.times_ns(), frames.stamp_origin())
+    notes: list[str] = []
+    with check_videos(params):
+        for name, stream in VIDEOS.items():
+            path = trial_files[name]
+            frames = scan(path)
+            streams[stream] = read_stream(path, frames, frames.times_ns(), frames.stamp_origin(), notes)
     label = next(iter(files)).split("/", 1)[0]
     attributes: dict[str, Attribute] = {"sensor": "gelsight-mini", "object": label, "slip": SLIP in trial_files}
-    return RecordingOutput(streams, {**attributes, **published_attribute("gelsight-slip")}, rows={})
+    return RecordingOutput(streams, {**attributes, **published_attribute("gelsight-slip")}, notes, rows={})

@@ -20,7 +20,7 @@ from tacpipe.video.stream import read_format
 
 CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.difference": lambda params, place: DifferenceChannels(
-        params.rows, params.columns, params.reference_frames
+        params.rows, params.columns, params.reference_frames, place
     ),
     "extract.markers": lambda params, place: MarkerChannels(params.rows, params.columns, params.pitch_mm, place),
 }  # channels by stage, of its params and the name of the stream

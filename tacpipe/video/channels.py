@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bytes, Float32s
 from tacpipe.errors import TacpipeError
-from tacpipe.video.decoding import GREY, cell_means, open_decoder, padded_packet
+from tacpipe.video.decoding import GREY, FrameDecoder, cell_means, has_lost_block, padded_packet
 from tacpipe.video.encoding import RGB
 from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
 from tacpipe.video.stream import PACKET, VideoFormat
@@ -35,14 +35,20 @@ class FrameChannels(Protocol):
     def values(self, image: Bytes) -> AnyFloats:
         """Return the channels of the next frame (field,), NaN for missing values."""
 
+    def skip(self) -> None:
+        """Leave out the next frame, which is damaged. Raises `TacpipeError` if the untouched gel is then unknown."""
+
 
 class DifferenceChannels:
-    """The mean brightness of each cell of a grid and colour, minus that of the first frames."""
+    """The mean brightness of each cell of a grid and colour, minus that of the first frames.
+
+    ``place`` names the stream in errors.
+    """
 
     grey = False
 
-    def __init__(self, rows: int, columns: int, reference_frames: int) -> None:
-        self._rows, self._columns, self._reference_frames = rows, columns, reference_frames
+    def __init__(self, rows: int, columns: int, reference_frames: int, place: str) -> None:
+        self._rows, self._columns, self._left, self._place = rows, columns, reference_frames, place
         self._reference_sum, self._reference_count = np.zeros((rows, columns, len(COLOURS))), 0
 
     def fields(self) -> list[pa.Field]:
@@ -59,9 +65,19 @@ class DifferenceChannels:
     def values(self, image: Bytes) -> AnyFloats:
         """Return the brightness differences of the next frame from the mean of the first frames, flat (cell and colour,)."""
         means = cell_means(image, self._rows, self._columns)
-        if self._reference_count < self._reference_frames:
+        if self._left:
             self._reference_sum, self._reference_count = self._reference_sum + means, self._reference_count + 1
+            self._left -= 1
         return (means - self._reference_sum / self._reference_count).ravel()
+
+    def skip(self) -> None:
+        """Leave out the next frame. Raises `TacpipeError` if all frames that show the untouched gel are damaged."""
+        self._left = max(0, self._left - 1)
+        if not self._left and not self._reference_count:
+            raise TacpipeError(
+                f"{self._place}: all frames that show the untouched gel are damaged. Give more with --reference-frames, or "
+                f"leave the recording out with --skip-bad."
+            )
 
 
 class MarkerChannels:
@@ -112,6 +128,14 @@ class MarkerChannels:
         moved = self._scale * (positions_px - grid.positions_px)  # (marker, xy)
         return np.append(moved.ravel(), is_detected[exists].mean())
 
+    def skip(self) -> None:
+        """Leave out the next frame. Raises `TacpipeError` if it is the first."""
+        if self._tracker is None:
+            raise TacpipeError(
+                f"{self._place}: the first frame, which shows the untouched gel, is damaged. Leave the recording out with "
+                f"--skip-bad."
+            )
+
 
 def _place(row: int, column: int, columns: int) -> dict[str, str]:
     """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
@@ -122,18 +146,15 @@ class IntraDecoder:
     """Decodes the packets of a live camera, each of which is a complete image."""
 
     def __init__(self, video_format: VideoFormat, *, grey: bool) -> None:
-        self._format, self._context = video_format, open_decoder(video_format)
+        self._format, self._decoder = video_format, FrameDecoder(video_format)
         self._pixels = GREY if grey else RGB
 
     def decode(self, packet: bytes) -> Bytes | None:
         """Return the image of a packet, or None for a damaged one or one of another size."""
-        import av
-
-        try:
-            frames: list[Any] = self._context.decode(padded_packet(packet))
-        except (av.error.FFmpegError, ValueError):
+        frames, is_damaged = self._decoder.decode(padded_packet(packet))
+        if is_damaged or not frames or frames[0].is_corrupt or has_lost_block(self._format.codec, packet):
             return None
-        if not frames or (frames[0].width, frames[0].height) != (self._format.width_px, self._format.height_px):
+        if (frames[0].width, frames[0].height) != (self._format.width_px, self._format.height_px):
             return None
         image: Bytes = frames[0].to_ndarray(format=self._pixels, threads=1)
         return image
@@ -156,7 +177,7 @@ class LiveChannels:
     def push(self, frames: FrameBatch) -> pa.Table:
         """Return the rows of the frames that can be decoded, with their clocks; others are omitted.
 
-        Raises the errors of the channels' ``values``.
+        Raises the errors of the channels' ``values`` and ``skip``.
         """
         rows: list[int] = []
         values: list[AnyFloats] = []
@@ -166,6 +187,8 @@ class LiveChannels:
             if image is not None:
                 rows.append(row)
                 values.append(self._channels.values(image))
+            elif packet:
+                self._channels.skip()
         clocks = [pa.array(np.asarray(frames.column(name))[rows]) for name in self.schema.names if name in CLOCKS]
         matrix: Float32s = np.array(values, np.float32).reshape(len(rows), len(self.schema) - len(clocks))
         return pa.table([*clocks, *map(pa.array, np.ascontiguousarray(matrix.T))], schema=self.schema)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -17,9 +17,23 @@ from tacpipe.arrays import AnyArray, Bools, Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.plugins import extras
+from tacpipe.plugins.video_checks import video_checks
 from tacpipe.printable import plain
-from tacpipe.video.decoding import NEEDED_BY, open_decoder
-from tacpipe.video.stream import BATCH_ROWS, DTS, KEY_FRAME, PACKET, PTS, VideoFormat, in_decode_order, reorder_frames
+from tacpipe.video import lengths
+from tacpipe.video.decoding import NEEDED_BY, damaged_frames, error_messages, open_decoder
+from tacpipe.video.stream import (
+    BATCH_ROWS,
+    DAMAGED,
+    DTS,
+    KEY_FRAME,
+    PACKET,
+    PTS,
+    VideoFormat,
+    damage_field,
+    describe_damage,
+    in_decode_order,
+    reorder_frames,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,6 +51,7 @@ DEMUXERS = {  # FFmpeg's demuxer by extension; the content does not choose it, b
 IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # file extension -> FFmpeg's codec
 IMAGE_DEMUXERS = {"mjpeg": "jpeg_pipe", "png": "png_pipe", "webp": "webp_pipe"}
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
+UNCHECKED = ("vp8",)  # codecs whose decoders do not notice damage
 WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files without presentation times
 NOMINAL = "from nominal rate"  # origin of timestamps computed from a file's frame rate
 FROM_PTS = "from presentation times"  # origin of timestamps computed from a file's presentation times
@@ -54,6 +69,8 @@ class VideoScan:
     key_frame: Bools  # (frame,)
     packet_index: Int64s  # (frame,), position in the file
     bytes: int  # size of all packets
+    suspect: Bools  # (frame,), whether the file is damaged next to the packet
+    cut_frames: int = 0  # number of frames that the file states and does not hold
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -83,21 +100,26 @@ def scan(path: Path) -> VideoScan:
     """Return timestamps, order and format of the frames in a file's first video stream.
 
     If a file has no presentation times and its codec may reorder frames, the frames are decoded once to find their
-    order. Raises `TacpipeError` with the file's name if it cannot be read.
+    order. Raises `TacpipeError` with the file's name if it cannot be read, or is shorter than it states, unless
+    `video_checks` accepts that.
     """
-    with _open_input(path) as container:
+    with error_messages() as messages, _open_input(path) as container:
         video = _video_stream(path, container)
-        packets = [
-            (packet.pts, packet.dts, packet.is_keyframe, packet.size)
-            for packet in container.demux(video)
-            if packet.size
-        ]
+        packets, suspect = _read_packets(container, video, is_after_damage=bool(messages))
         if not packets:
             raise TacpipeError(f"{path} has no frame. Copy it again from its source, or leave it out.")
         video_format = _read_video_format(path, video)
         rates = (video.base_rate, video.average_rate)
         delayed = bool(video.codec_context.has_b_frames)
+        has_sound = len(container.streams) > len(container.streams.video)  # it can be longer than the video
+        stated = _StatedLength(
+            video.frames,
+            0.0 if has_sound else (container.duration or 0) / 10**6,
+            float(video.average_rate or 0),
+            float(video.time_base),
+        )
     pts, dts, is_key_frame, sizes = (list(column) for column in zip(*packets, strict=True))
+    cut_frames = _cut_frames(path, pts, dts, stated)
     if None in pts or len(set(pts)) < len(pts) or (delayed and DEMUXERS[path.suffix.lower()] in WITHOUT_PTS):
         order = _presentation_order(path, video_format) if delayed else list(range(len(packets)))
         dts = _increasing(dts)
@@ -121,7 +143,73 @@ def scan(path: Path) -> VideoScan:
         np.array(is_key_frame, bool)[order_by_pts],
         order_by_pts.astype(np.int64),
         sum(sizes),
+        np.array(suspect, bool)[order_by_pts],
+        cut_frames,
     )
+
+
+def _read_packets(
+    container: Any, video: Any, *, is_after_damage: bool
+) -> tuple[list[tuple[int | None, int | None, bool, int]], list[bool]]:
+    """Return times, key flag and size of each packet of a stream, and whether it is next to damage of the file.
+
+    Where FFmpeg finds something else than a packet, it skips to the next, and packets may be lost in between.
+    ``is_after_damage``: whether it reported damage when it opened the file, for which it reads the first packets.
+    """
+    packets: list[tuple[int | None, int | None, bool, int]] = []
+    suspect: list[bool] = []
+    demuxed = container.demux(video)
+    while True:
+        with error_messages() as messages:
+            packet = next(demuxed, None)
+        if messages:
+            is_after_damage = True
+            suspect[-1:] = [True] * len(suspect[-1:])
+        if packet is None:
+            return packets, suspect
+        if packet.size:
+            packets.append((packet.pts, packet.dts, packet.is_keyframe, packet.size))
+            suspect.append(is_after_damage or packet.is_corrupt)
+            is_after_damage = False
+
+
+@dataclass(frozen=True)
+class _StatedLength:
+    """The length of a video according to its file; 0 where the file states none."""
+
+    frames: int
+    duration_s: float
+    rate_hz: float
+    time_base_s: float
+
+
+def _cut_frames(path: Path, pts: Sequence[int | None], dts: Sequence[int | None], stated: _StatedLength) -> int:
+    """Return the number of frames that a file states and does not hold, at least 1 if its end is missing.
+
+    ``pts`` and ``dts`` are the times of its packets. Raises `TacpipeError` if there are any, unless `video_checks`
+    accepts them.
+    """
+    demuxer, count = DEMUXERS[path.suffix.lower()], len(pts)
+    stated_frames = stated.frames
+    if demuxer == "avi":  # decoding times count frames, including those without a packet
+        stated_frames = max(stated_frames, lengths.avi_frames(path))
+        count = max(count, (dts[-1] or 0) - (dts[0] or 0) + 1)
+    stamps = sorted(stamp for stamp in pts if stamp is not None)
+    steps_s = [1 / stated.rate_hz if stated.rate_hz else 0.0, *(np.diff(stamps) * stated.time_base_s)]
+    last_s = stamps[-1] * stated.time_base_s if stamps else stated.duration_s
+    lost_bytes = lengths.missing_bytes(path, demuxer)
+    is_short = stated.duration_s - last_s > 2 * max(steps_s)
+    if stated_frames <= count and not lost_bytes and not is_short:
+        return 0
+    of_frames = max(stated_frames, round(stated.duration_s * stated.rate_hz))
+    if not video_checks().accept_cut:
+        total = f"{of_frames:,}" if of_frames > count else "an unknown number"
+        end = f", and {lost_bytes:,} bytes at its end are missing" if lost_bytes else ""
+        raise TacpipeError(
+            f"{path} is cut after frame {count:,} of {total}{end}. Copy it again from its source, leave it out with "
+            f"--skip-bad, or read what there is with --accept-cut."
+        )
+    return max(1, of_frames - count)
 
 
 def scan_images(paths: Sequence[Path]) -> VideoFormat:
@@ -147,17 +235,22 @@ def scan_images(paths: Sequence[Path]) -> VideoFormat:
     return first
 
 
-def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
+def read_images(paths: Sequence[Path], t_ns: Times, stamp_origin: str | None, notes: list[str]) -> pa.RecordBatchReader:
     """Return a stream of frames from image files, read on demand; ``t_ns`` (frame,) are the timestamps.
 
     Presentation times are distinct microseconds since the first frame. ``stamp_origin`` is the origin of timestamps
-    that do not come from a clock. Raises `TacpipeError` as `scan_images` does.
+    that do not come from a clock. A note on damaged images is added to ``notes``. Raises `TacpipeError` as `scan_images`
+    does.
     """
     video_format = scan_images(paths)
     index = np.arange(len(paths))
     pts = np.maximum.accumulate((t_ns - t_ns[:1]) // 1000 - index) + index
     clocks = (pts, pts, np.ones(len(paths), bool))
-    return packet_stream(video_format, map(regular.source, paths), clocks, t_ns, None, stamp_origin)
+
+    def read(damaged: Bools | None) -> pa.RecordBatchReader:
+        return packet_stream(video_format, map(regular.source, paths), clocks, t_ns, None, stamp_origin, damaged)
+
+    return _verified(read, video_format, np.zeros(len(paths), bool), paths[0].parent, notes)
 
 
 def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
@@ -179,20 +272,66 @@ def read_packets(path: Path, frames: VideoScan) -> Iterator[bytes]:
         raise TacpipeError(f"{path} changed while it was read. Run the command again.")
 
 
-def read_stream(path: Path, frames: VideoScan, t_ns: Times, stamp_origin: str | None) -> pa.RecordBatchReader:
+def read_stream(
+    path: Path, frames: VideoScan, t_ns: Times, stamp_origin: str | None, notes: list[str]
+) -> pa.RecordBatchReader:
     """Return the stream of frames of a file, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    ``stamp_origin`` is the origin of timestamps that do not come from a clock. Raises `TacpipeError` if the file cannot
-    be read, also while the stream is read.
+    ``stamp_origin`` is the origin of timestamps that do not come from a clock. Notes on damaged frames, and on frames that
+    the file does not hold, are added to ``notes``. Raises `TacpipeError` if the file cannot be read, also while the
+    stream is read.
     """
-    return packet_stream(
-        frames.video_format,
-        read_packets(path, frames),
-        (frames.pts, frames.dts, frames.key_frame),
-        t_ns,
-        frames.counter(),
-        stamp_origin,
-    )
+    clocks, counter = (frames.pts, frames.dts, frames.key_frame), frames.counter()
+
+    def read(damaged: Bools | None) -> pa.RecordBatchReader:
+        packets = read_packets(path, frames)
+        return packet_stream(frames.video_format, packets, clocks, t_ns, counter, stamp_origin, damaged)
+
+    if frames.cut_frames:
+        notes.append(
+            f"{path} is cut after frame {len(frames):,} of {len(frames) + frames.cut_frames:,}; the rest is missing."
+        )
+    return _verified(read, frames.video_format, frames.suspect, path, notes)
+
+
+def _verified(
+    read: Callable[[Bools | None], pa.RecordBatchReader],
+    video_format: VideoFormat,
+    suspect: Bools,
+    path: Path,
+    notes: list[str],
+) -> pa.RecordBatchReader:
+    """Return the stream that ``read`` returns for the mask of damaged frames (frame,), or None if there are none.
+
+    ``suspect`` are the frames next to damage of the file. Raises the errors of `find_damage`.
+    """
+    damaged = find_damage(read(None), video_format, suspect, path, notes)
+    return read(damaged if damaged.any() else None)
+
+
+def find_damage(
+    stream: Iterable[pa.RecordBatch], video_format: VideoFormat, suspect: Bools, path: Path, notes: list[str]
+) -> Bools:
+    """Return which frames of a stream are damaged (frame,), none if `video_checks` does not verify videos.
+
+    ``suspect`` are the frames next to damage of the file. A note about damaged frames is added to ``notes``. Raises
+    `TacpipeError` if all are.
+    """
+    import pyarrow as pa
+
+    if not video_checks().verify_video:
+        return np.zeros(len(suspect), bool)
+    damaged = damaged_frames(video_format, (pa.Table.from_batches([batch]) for batch in stream), suspect)
+    if damaged.all() and len(damaged):
+        raise TacpipeError(
+            f"{path}: none of the {len(damaged):,} frames can be decoded as {plain(video_format.codec)}. Copy it again from "
+            f"its source, or leave it out."
+        )
+    if damaged.any():
+        notes.append(f"{path}: {describe_damage(damaged)}.")
+    if video_format.codec in UNCHECKED:
+        notes.append(f"{path} is {plain(video_format.codec)}, whose frames carry no check: damage to them is not seen.")
+    return damaged
 
 
 def packet_stream(
@@ -202,11 +341,12 @@ def packet_stream(
     t_ns: Times,
     seq: Int64s | None,
     stamp_origin: str | None,
+    damaged: Bools | None = None,
 ) -> pa.RecordBatchReader:
     """Return a stream of frames from packets in presentation order, taken on demand.
 
     ``clocks`` are ``pts``, ``dts`` and ``key_frame`` of each packet, each (frame,). ``seq`` counts frames, None without
-    a counter.
+    a counter. ``damaged`` (frame,) becomes a column; None if no frame is known to be damaged.
     """
     import pyarrow as pa
 
@@ -215,6 +355,8 @@ def packet_stream(
     columns: dict[str, AnyArray] = {"t_ns": t_ns, PTS: pts, DTS: dts, KEY_FRAME: key_frame}
     if seq is not None:
         columns["seq"] = seq
+    if damaged is not None:
+        schema, columns[DAMAGED] = schema.append(damage_field()), damaged
 
     def batches() -> Iterator[pa.RecordBatch]:
         source = iter(packets)

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.errors import TacpipeError
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt, listed, plain
+from tacpipe.signals.runs import runs
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 PACKET, PTS, DTS, KEY_FRAME = "packet", "pts", "dts", "key_frame"
+DAMAGED = "damaged"  # column of streams with damaged frames
 BATCH_ROWS = 64  # number of encoded frames in memory at once
 MAX_SIDE_PX = 1 << 14  # maximum width and height of a frame
+MAX_PIXELS = 1 << 24  # maximum size of a frame, whose image then has 50 MB; 4096 x 4096 pixels
 MAX_REORDER = 1 << 10  # maximum plausible number of frames between decoding and presentation
 _CODEC, _WIDTH, _HEIGHT, _PIXELS = "codec", "width_px", "height_px", "pixel_format"
 _TIME_BASE, _RATE, _EXTRADATA, _REORDER = "time_base_s", "nominal_rate_hz", "extradata", "reorder_frames"
@@ -49,11 +52,12 @@ class VideoFormat:
     def __post_init__(self) -> None:
         """Check the values. Raises `TacpipeError` for implausible ones."""
         sides_fit = 0 < self.width_px <= MAX_SIDE_PX and 0 < self.height_px <= MAX_SIDE_PX
+        sides_fit = sides_fit and self.width_px * self.height_px <= MAX_PIXELS
         if not sides_fit or self.time_base <= 0 or not 0 <= self.reorder_frames <= MAX_REORDER or not self.codec:
             raise TacpipeError(
                 f"A video of {self.width_px} x {self.height_px} pixels (codec {self.codec or 'unknown'}, time base "
                 f"{self.time_base} s, {self.reorder_frames} frames out of order) cannot be read; frames have 1 to "
-                f"{MAX_SIDE_PX} pixels a side."
+                f"{MAX_SIDE_PX} pixels a side, and at most {MAX_PIXELS:,} in all."
             )
 
     def describe(self) -> str:
@@ -122,6 +126,27 @@ class VideoFormat:
         return pa.schema([time_field(stamp_origin), *counter, *self.fields()])
 
 
+def damage_field() -> pa.Field:
+    """Return the field ``damaged``, a mask of the frames that the decoder reports as damaged when they are ingested."""
+    import pyarrow as pa
+
+    return pa.field(DAMAGED, pa.bool_(), metadata={"unit": "1", "quantity": "mask"})
+
+
+def describe_damage(damaged: Bools) -> str:
+    """Return text that counts and names the damaged frames (frame,), numbered from 0.
+
+    >>> describe_damage(np.array([False, True, True, True, False, True]))
+    '4 of 6 frames are damaged (1 to 3, 5)'
+    """
+    starts, stops = runs(damaged)
+    frames = [
+        f"{start}" if stop == start + 1 else f"{start} to {stop - 1}"
+        for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)
+    ]
+    return f"{damaged.sum():,} of {len(damaged):,} frames are damaged ({listed(frames)})"
+
+
 def read_format(source: pa.Table | pa.Schema | Columns) -> VideoFormat | None:
     """Return the format of a stream of frames, or None for other streams.
 
@@ -156,7 +181,7 @@ def in_decode_order(
     buffered: list[tuple[int, int, dict[str, int | bool | bytes]]] = []  # dts, row, columns
     row = 0
     for batch in batches:
-        names = [name for name in (PACKET, PTS, DTS, KEY_FRAME) if name in batch.column_names]
+        names = [name for name in (PACKET, PTS, DTS, KEY_FRAME, DAMAGED) if name in batch.column_names]
         for columns in batch.select(names).to_pylist():
             heapq.heappush(buffered, (columns[DTS], row, columns))
             row += 1

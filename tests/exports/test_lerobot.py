@@ -1,6 +1,7 @@
 """LeRobot datasets as pyarrow and json read them; LeRobot's own loader reads them in `tests.exports.test_other_tools`."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -310,3 +311,11 @@ def test_cameras_with_different_codec_headers_are_exported_together(lab: Lab) ->
     write_dataset(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in "ab"})
     lab.run(f"{LEROBOT} --no-originals")
     assert len(list(Path("lr/videos").rglob("*.mp4"))) == 2
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only as root does the encoder change the scheduling")
+def test_encoding_av1_does_not_move_this_process_before_others(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(lab, "mpeg4", "avi", monkeypatch, b_frames=0)
+    before = os.sched_getscheduler(0)
+    lab.run(f"{LEROBOT} --no-originals --video-codec av1")
+    assert os.sched_getscheduler(0) == before

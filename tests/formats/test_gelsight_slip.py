@@ -30,7 +30,7 @@ def test_a_trial_becomes_two_streams_of_the_frames_of_its_videos_and_two_labels(
         columns = recording.columns(f"gel{camera}")
         video_format = stream.read_format(columns)
         assert video_format is not None
-        images = dict(decoding.decode_frames(video_format, decoding.read_batches(columns)))
+        images = videos.sound_images(video_format, decoding.read_batches(columns))
         expected = videos.decoded(folder / f"camera_{camera}.avi")
         assert len(images) == len(expected) == 13 + camera
         assert all(np.array_equal(images[row], image) for row, image in enumerate(expected))

@@ -45,7 +45,7 @@ def frames(dataset: str, stream: str) -> tuple[VideoFormat, list[Bytes]]:
     columns = recording.columns(stream)
     video_format = read_format(columns)
     assert video_format is not None
-    return video_format, [image for _, image in decoding.decode_frames(video_format, decoding.read_batches(columns))]
+    return video_format, list(videos.sound_images(video_format, decoding.read_batches(columns)).values())
 
 
 def column(dataset: str, stream: str, name: str) -> list[Any]:

@@ -83,14 +83,14 @@ def test_markers_are_measured_to_a_fifth_of_a_pixel_up_to_half_their_distance(
 
 
 def test_covered_markers_are_null_and_never_invented(trial: dict[str, pa.Table]) -> None:
-    from tacpipe.video.decoding import decode_frames
     from tacpipe.video.encoding import encode_images
     from tacpipe.video.stream import read_format
+    from tests.video import videos
 
     frames = trial["gel1"]
     video_format = read_format(frames)
     assert video_format is not None
-    images = [image.copy() for _, image in decode_frames(video_format, [frames])]
+    images = list(videos.sound_images(video_format, [frames]).values())
     for image in images[40:]:
         image[80:150, 100:200] = [110, 120, 135]  # a patch without markers
     column = pa.array(list(encode_images(video_format, images)), pa.binary())

@@ -1,6 +1,6 @@
 """Write small videos with PyAV, and read them by PyAV alone, as what tacpipe reads is compared with."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -8,8 +8,11 @@ from typing import Any, cast
 
 import av
 import numpy as np
+import pyarrow as pa
 
 from tacpipe.arrays import Bytes
+from tacpipe.video import decoding
+from tacpipe.video.stream import VideoFormat
 
 HEIGHT, WIDTH, RATE_HZ = 48, 64, 25
 PIXELS = {"mjpeg": "yuvj420p", "png": "rgb24", "ffv1": "bgr0"}
@@ -17,6 +20,7 @@ OPTIONS = {
     "libx264": {"g": "12", "bf": "3", "b_strategy": "0", "x264-params": "log-level=none"},
     "libx265": {"x265-params": "keyint=12:bframes=4:open-gop=1:scenecut=0:log-level=none"},
     "mpeg4": {"g": "12", "bf": "2"},
+    "mjpeg": {"huffman": "default"},
 }
 
 
@@ -70,6 +74,14 @@ def decoded(path: Path) -> list[Bytes]:
     """The images (row, column, rgb) of a file as PyAV decodes them."""
     with av.open(str(path)) as container:
         return [cast(Any, frame).to_ndarray(format="rgb24", threads=1) for frame in container.decode(video=0)]
+
+
+def sound_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> dict[int, Bytes]:
+    """The images of a stream by row; none may be damaged."""
+    images = dict(decoding.decode_frames(video_format, batches))
+    sound = {row: image for row, image in images.items() if image is not None}
+    assert len(sound) == len(images)
+    return sound
 
 
 def packets(path: Path) -> list[bytes]:

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from tacpipe.arrays import Int64s
+from tacpipe.arrays import Bools, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
@@ -30,7 +30,7 @@ from tacpipe.io import parquet, regular
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
-from tacpipe.video.files import VideoScan, packet_stream, read_packets, scan
+from tacpipe.video.files import VideoScan, find_damage, packet_stream, read_packets, scan
 from tacpipe.video.images import PICTURE
 from tacpipe.video.stream import cut_rows
 
@@ -194,7 +194,10 @@ class LeRobotContainer:
             notes = [self._describe_rate(t_ns)] if stamp_source == FROM_STAMPS else []
         clock = pa.field(CLOCK.column, pa.int64(), metadata=time_metadata)
         frames = frames if rows else frames.slice(0, 0)
-        streams = [self._video_stream(episode, key, names[_stream_stem(key)], t_ns, clock) for key in videos]
+        streams = [
+            self._video_stream(episode, key, names[_stream_stem(key)], (t_ns, clock), notes if rows else None)
+            for key in videos
+        ]
         streams = [replace(stream, time=replace(CLOCK, origin="unix")) if exact_keys else stream for stream in streams]
         for source, features in selected.items():
             columns = [(clock, pa.array(t_ns[: frames.num_rows]))]
@@ -215,15 +218,17 @@ class LeRobotContainer:
         )
 
     def _video_stream(
-        self, episode: EpisodeDescription, key: str, name: str, t_ns: Int64s, clock: pa.Field
+        self, episode: EpisodeDescription, key: str, name: str, clock: tuple[Int64s, pa.Field], notes: list[str] | None
     ) -> SourceStream:
-        """Return a stream of an episode's frames in the video ``key``, with the timestamps ``t_ns`` (frame,).
+        """Return a stream of an episode's frames in the video ``key``.
 
-        Raises `TacpipeError` if the video is unreadable, shorter than the episode, or cannot be cut at the episode's
-        start and end.
+        ``clock`` are the timestamps (frame,) and their field. Damaged frames are marked and noted, unless ``notes`` is
+        None. Raises `TacpipeError` if the video is unreadable, shorter than the episode, or cannot be cut at the
+        episode's start and end.
         """
         path = regular.inside(self.path, episode.videos[key])
         frames = _scan_video(path, path.stat().st_mtime_ns)
+        t_ns, clock_field = clock
         half_step_s = 0.5 / self._about.fps
         start_s = episode.video_starts_s.get(key, 0.0)
         start = int(np.searchsorted(frames.times_ns() / 1e9, start_s - half_step_s))
@@ -242,13 +247,19 @@ class LeRobotContainer:
         seq = None if counter is None else counter[start:stop] - counter[start]
         clocks = (frames.pts[start:stop], frames.dts[start:stop], frames.key_frame[start:stop])
 
-        def read() -> Iterator[pa.Table]:
+        def batches(damaged: Bools | None) -> pa.RecordBatchReader:
             packets = itertools.islice(read_packets(path, frames), start, stop)
-            for batch in packet_stream(frames.video_format, packets, clocks, t_ns, seq, None):
+            return packet_stream(frames.video_format, packets, clocks, t_ns, seq, None, damaged)
+
+        suspect = frames.suspect[start:stop]
+        damaged = None if notes is None else find_damage(batches(None), frames.video_format, suspect, path, notes)
+        damaged = damaged if damaged is not None and damaged.any() else None
+        schema = pa.schema([clock_field, *list(batches(damaged).schema)[1:]])
+
+        def read() -> Iterator[pa.Table]:
+            for batch in batches(damaged):
                 yield pa.Table.from_batches([batch]).cast(schema)
 
-        fields = list(frames.video_format.schema(counted=seq is not None))
-        schema = pa.schema([clock, *fields[1:]])
         return SourceStream(key, name, CLOCK, Batched(schema, len(t_ns), read), episode.length)
 
     def _frames(self, episode: EpisodeDescription, keys: Sequence[str]) -> pa.Table:

@@ -464,7 +464,7 @@ def _convert_block(
 
 
 def camera_batches(
-    path: Path, stream: StreamLayout, stamps_path: Path | None = None, notes: list[str] | None = None
+    path: Path, stream: StreamLayout, stamps_path: Path | None, notes: list[str]
 ) -> pa.RecordBatchReader:
     """Return the frames of a video file or a folder of images with ``t_ns``, read on demand.
 
@@ -507,8 +507,8 @@ def camera_batches(
         origin = "from the start of the recording"
     t_ns = t_ns + (_start_ns(stream) if origin else 0) + round(stream.time.offset_s * 10**9)
     if frames is None:
-        return video_files.read_images(images, t_ns, origin)
-    return video_files.read_stream(path, frames, t_ns, origin)
+        return video_files.read_images(images, t_ns, origin, notes)
+    return video_files.read_stream(path, frames, t_ns, origin, notes)
 
 
 def image_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = None) -> pa.RecordBatchReader:

@@ -109,7 +109,7 @@ def _video_images(path: str) -> Iterator[bytes]:
         return
     import pyarrow as pa
 
-    stream = files.read_stream(file, frames, frames.times_ns(), None)
+    stream = files.read_stream(file, frames, frames.times_ns(), None, [])
     batches = (pa.Table.from_batches([batch]) for batch in stream)
     yield from (image for _, image in jpeg_images(frames.video_format, batches))
 

@@ -13,23 +13,23 @@ import pytest
 import tacpipe
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import ContainerCommand
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.video import decoding, stream
+from tacpipe.video import stream
 from tests.conftest import Lab
 from tests.formats.builders import about, layout_params
 from tests.formats.lerobot import files
 from tests.video import videos
 
-NONE = Params()
 LEROBOT = ContainerCommand("lerobot")
 lerobot = registry.load("ingest.lerobot")
 EPISODE = "pick-episode_00000{}"
 
 
-def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
+def read(folder: Path, layout: str = "") -> dict[str, RecordingOutput]:
+    params = lerobot.params(layout_params(layout).layout if layout else "")
     return {
         name: lerobot(params, value.files, value.values) for name, value in LEROBOT.discover(params, folder).items()
     }
@@ -92,7 +92,7 @@ def test_frames_of_an_episode_are_those_of_its_part_of_the_video(tmp_path: Path,
         assert sorted(table["packet"].to_pylist()) == sorted(videos.packets(path)[start : start + lengths[episode]])
         video_format = stream.read_format(table)
         assert video_format is not None
-        images = dict(decoding.decode_frames(video_format, [table]))
+        images = videos.sound_images(video_format, [table])
         expected = videos.decoded(path)[start : start + lengths[episode]]
         assert all(np.array_equal(images[row], image) for row, image in enumerate(expected))
         assert table["t_ns"].to_pylist() == result.streams["state"]["t_ns"].to_pylist()
@@ -195,7 +195,7 @@ def test_a_layout_renames_and_adds_what_the_dataset_does_not_state(tmp_path: Pat
     files.write_v3(tmp_path / "pick")
     text = '[recordings]\nname = "{recording}"\n[streams.robot]\nsource = "action"\ncolumns = [\n'
     text += '{ match = "action_{n}", name = "joint{n}_target_rad", quantity = "target_joint_position", unit = "rad" }]'
-    result = read(tmp_path, layout_params(text))
+    result = read(tmp_path, text)
     assert set(result) == {"episode_000000", "episode_000001", "episode_000002"}
     table = result["episode_000002"].streams["robot"]
     assert about(table, "joint6_target_rad")["quantity"] == "target_joint_position"
@@ -254,14 +254,14 @@ def test_a_damaged_file_costs_its_own_episode(
 ) -> None:
     files.write_v2(tmp_path / "pick")
     damage(tmp_path / "pick")
-    sources = LEROBOT.discover(NONE, tmp_path)
+    sources = LEROBOT.discover(lerobot.params(), tmp_path)
     assert len(sources) == 3
     for name, entry in sources.items():
         if name != EPISODE.format(1):
-            assert lerobot(NONE, entry.files, entry.values).streams
+            assert lerobot(lerobot.params(), entry.files, entry.values).streams
             continue
         with pytest.raises(TacpipeError) as raised:
-            lerobot(NONE, entry.files, entry.values)
+            lerobot(lerobot.params(), entry.files, entry.values)
         assert all(part in str(raised.value) for part in parts)
 
 
@@ -336,5 +336,5 @@ def test_names_that_are_nested_deep_are_names(tmp_path: Path) -> None:
     info = json.loads(path.read_text())
     info["features"]["action"]["names"] = json.loads("[" * 800 + json.dumps([f"a{n}" for n in range(7)]) + "]" * 800)
     path.write_text(json.dumps(info))
-    (source,) = LEROBOT.discover(NONE, tmp_path).values()
-    assert "a6" in lerobot(NONE, source.files, source.values).streams["action"].schema.names
+    (source,) = LEROBOT.discover(lerobot.params(), tmp_path).values()
+    assert "a6" in lerobot(lerobot.params(), source.files, source.values).streams["action"].schema.names

@@ -55,7 +55,7 @@ def frames_of(recording: Recording) -> list[Bytes]:
     columns = recording.columns("gel")
     video_format = stream.read_format(columns)
     assert video_format is not None
-    return [image for _, image in decoding.decode_frames(video_format, decoding.read_batches(columns))]
+    return list(videos.sound_images(video_format, decoding.read_batches(columns)).values())
 
 
 def ingest(lab: Lab, layout: str) -> list[Recording]:
