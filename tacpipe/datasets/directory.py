@@ -388,7 +388,7 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
         if symbolic:  # the target of a link may change without a change of the directory
             status = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
         return ""
     if (status.st_dev, status.st_ino) == (stored.st_dev, stored.st_ino):
         return "files" if symbolic else "links"
