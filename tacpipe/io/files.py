@@ -255,7 +255,9 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
     if error.errno in _READ_ONLY:
         refused = _refused(error.filename2, error.filename, root, writing=True)
         if refused is not None and refused[1] != os.geteuid():
-            text = f"The store {root} cannot be written: {_advice(*refused)} Or name another store in TACPIPE_STORE."
+            text = (
+                f"The store {root} cannot be written: {_advice(*refused, root)} Or name another one in TACPIPE_STORE."
+            )
             return DeniedError(text, refused[1])
         return StorageError(
             f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
@@ -274,7 +276,7 @@ def read_error(path: Path | str, error: OSError) -> StorageError:
     """
     refused = _refused(path) if error.errno in _READ_ONLY else None
     if refused is not None:
-        return DeniedError(f"{path} cannot be read: {_advice(*refused)}", refused[1])
+        return DeniedError(f"{path} cannot be read: {_advice(*refused, path)}", refused[1])
     hint = _hint(error, "check the disk and its permissions")
     return StorageError(
         f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
@@ -301,11 +303,11 @@ def _refused(*paths: Path | str | None, writing: bool = False) -> tuple[Path, in
     return None
 
 
-def _advice(path: Path, owner: int) -> str:
-    """Return a sentence about a path that excludes this user, and what its owner can do."""
+def _advice(refusing: Path, owner: int, path: Path | str) -> str:
+    """Return the owner of a file or folder that refuses access to ``path``, and what this owner can do."""
     return (
-        f"{path} belongs to the user {user_name(owner)}, who can share it by `chmod -R g+rwX {path}`, or all of a store "
-        f"by `tacpipe store init --shared STORE`."
+        f"{'it' if refusing == Path(path) else refusing} belongs to the user {user_name(owner)}, who can run "
+        f"`chmod -R g+rwX` on it, or `tacpipe store init --shared` on the store."
     )
 
 
