@@ -54,8 +54,8 @@ class MLflow:
         self._uri = place or os.environ.get("MLFLOW_TRACKING_URI") or MLFLOW_DATABASE
         if self._uri.startswith("sqlite:") and importlib.util.find_spec("sqlalchemy") is None:
             raise TacpipeError(
-                f"MLflow needs the package mlflow to write {without_credentials(self._uri)}, and mlflow-skinny is installed. "
-                f"Install mlflow, or give a server, as --track mlflow:http://127.0.0.1:5000."
+                f"MLflow needs the package mlflow to write {without_credentials(self._uri)}, and mlflow-skinny is "
+                f"installed. Install mlflow, or give a server, as --track mlflow:http://127.0.0.1:5000."
             )
         self._client = MlflowClient(self._uri)
         self._run = ""
