@@ -22,6 +22,7 @@ from typing import Any, TypedDict, cast
 
 from tacpipe.errors import DeniedError, LockedError, TacpipeError
 from tacpipe.io import regular, terminal
+from tacpipe.io.credentials import without_credentials
 from tacpipe.io.files import create, make_folder, patiently, readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
@@ -223,7 +224,7 @@ def parse_lease(path: Path, content: bytes) -> Run:
 
 def note(**extra: Any) -> bytes:
     """Return the description of a lease's holder as one line of JSON."""
-    command = shlex.join(["tacpipe", *sys.argv[1:]])
+    command = without_credentials(shlex.join(["tacpipe", *sys.argv[1:]]))
     value = {
         "host": platform.node(),
         "pid": os.getpid(),
