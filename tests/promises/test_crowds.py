@@ -279,13 +279,10 @@ def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
 
 def run_as(shared: Scene, user: int, words: str, code: int = 0) -> str:
     """Run a command of a user in the user's folder of the project; return what it printed."""
-    running = shared.start(f"{words} --jobs 1" if words.startswith(("simulate", "scale")) else words, **identity(user))
+    command = f"{words} --jobs 1" if words.startswith(("simulate", "scale")) else words
+    running = shared.start(command, TEST_USER=str(user), TEST_UMASK=UMASKS[user])
     assert kills.wait_for_exit(running) == code, (user, words, running.out.read_text())
     return running.out.read_text()
-
-
-def identity(user: int) -> dict[str, str]:
-    return {"TEST_USER": str(user), "TEST_UMASK": UMASKS[user]}
 
 
 @pytest.fixture
