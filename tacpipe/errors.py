@@ -43,6 +43,14 @@ class StorageError(TacpipeError):
     """The disk or the store failed, whatever was to be stored."""
 
 
+class DeniedError(StorageError):
+    """The permissions of a file or folder exclude this user. ``owner`` is the user id of its owner."""
+
+    def __init__(self, message: str, owner: int = -1) -> None:
+        super().__init__(message)
+        self.owner = owner
+
+
 class ShortageError(StorageError):
     """The computer ran out of memory, threads or processes, whatever was worked on."""
 

@@ -1,5 +1,6 @@
 """Looking at a store while a collection removes things from it reports nothing that vanished as damaged."""
 
+import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -7,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from tacpipe.io import files as files_of
 from tacpipe.maintenance import garbage, repair
 from tacpipe.store import layout
 from tacpipe.store.store import Store
@@ -30,8 +30,8 @@ def between(monkeypatch: pytest.MonkeyPatch, folder: str, act: Callable[[], obje
     list_names = layout.names
     listed_counts: list[int] = []
 
-    def names(root: Path, name: str) -> Iterator[str]:
-        listed_names = list(list_names(root, name))
+    def names(root: Path, name: str, note_denied: layout.NoteDenied) -> Iterator[str]:
+        listed_names = list(list_names(root, name, note_denied))
         if name == folder and not listed_counts:
             listed_counts.append(len(listed_names))
             act()
@@ -118,7 +118,7 @@ def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_mi
 def test_a_status_beside_a_collection_counts_what_it_still_finds(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, honest = littered.store, files_of.walk
+    store, honest = littered.store, os.walk
     draft = store.root / "tmp" / f".{'ab' * 16}"
     draft.write_bytes(b"touch")
     removed: list[Path] = []
@@ -134,7 +134,7 @@ def test_a_status_beside_a_collection_counts_what_it_still_finds(
             yield place, folders, files
 
     before = repair.status(store)
-    monkeypatch.setattr(repair, "walk", walk)
+    monkeypatch.setattr(os, "walk", walk)
     status = repair.status(store)
     assert draft in removed and len(removed) == 2
     assert status["tmp"]["files"] == 0 < status["objects"]["files"] < before["objects"]["files"]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 import tacpipe
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.maintenance import garbage, repair, sound_records
-from tacpipe.store import layout
 from tacpipe.store.store import Store
 from tests.conftest import Lab, write_source
 from tests.test_pipeline import counts, replace_stream
@@ -306,7 +305,7 @@ def test_damage_to_a_record_is_found_however_often_it_was_sound_before(
     lab.run("scale data/r -o data/s")
     assert repair.verify(lab.store).clean
     assert (lab.store.root / "presence" / sound_records.NOTE).is_file()
-    key = min(layout.names(lab.store.root, "records"))
+    key = min(lab.store.names("records"))
     path = Path(lab.store.record_path(key))
     before, content = path.stat(), path.read_bytes()
     path.write_bytes(content.replace(b"scale", b"scalf").replace(b"toy", b"tov"))

@@ -45,19 +45,32 @@ def add(program: typer.Typer, summary: str) -> None:
     program.add_typer(group, name="store")
 
 
-def init() -> None:
-    """Make this folder a project with its own store.
+def init(
+    path: Annotated[
+        Path | None, typer.Argument(help="Folder of the store; by default .tacpipe in this folder.")
+    ] = None,
+    shared: Annotated[
+        bool, typer.Option("--shared", help="Let the group of the store's folder read and write it.")
+    ] = False,
+) -> None:
+    """Make this folder a project with its own store, or create or share a store.
 
-    Datasets in the folders below use this store, unless a project among these
-    folders is marked by pyproject.toml, dvc.yaml, params.yaml or .git.
+    Datasets in the folders below use the project's store, unless a project among
+    these folders is marked by pyproject.toml, dvc.yaml, params.yaml or .git.
 
     Example: tacpipe store init
+
+    Example: tacpipe store init --shared data/store
     """
-    store = Store(Path.cwd() / layout.BESIDE_NAME)
+    from tacpipe.maintenance import sharing
+
+    store = Store(Path.cwd() / layout.BESIDE_NAME if path is None else path.absolute())
     store.prepare()
-    store.write_file(store.root / layout.PROJECT, b"")
-    store.sync(store.root / layout.PROJECT)
-    terminal.result(str(store.root))
+    text = sharing.share(store) if shared else str(store.root)
+    if path is None:
+        store.write_file(store.root / layout.PROJECT, b"")
+        store.sync(store.root / layout.PROJECT)
+    terminal.result(text)
 
 
 def status(as_json: AsJson = False) -> None:

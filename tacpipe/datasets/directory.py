@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -130,6 +131,7 @@ def _show(store: Store, planned: DirectoryChange, directory: Path) -> None:
     if edited and not planned.replace:
         raise replacing.edited_files_error(directory, edited)
     with writing(directory):
+        _require_writable(directory)
         before = None if current else replacing.keep_replaced(store, directory)
         lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
         if edited:
@@ -241,6 +243,13 @@ def _settle(store: Store, directory: Path, paths: Iterable[str]) -> None:
         sync_folder(str(folder))
     project = store.root.parent
     sync_folders(str(directory), str(project if directory.is_relative_to(project) else directory.parent))
+
+
+def _require_writable(directory: Path) -> None:
+    """Create a directory if it does not exist. Raises `OSError` if it cannot contain files, so that it gets no root."""
+    directory.mkdir(parents=True, exist_ok=True)
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(directory))
 
 
 @contextlib.contextmanager
@@ -388,7 +397,7 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
         if symbolic:  # the target of a link may change without a change of the directory
             status = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
         return ""
     if (status.st_dev, status.st_ino) == (stored.st_dev, stored.st_ino):
         return "files" if symbolic else "links"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from tacpipe.engine import provenance
 from tacpipe.engine.keys import DatasetIdentity, RolesIdentity, WorkerTask
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_input_error
 from tacpipe.io import files, memory, regular
-from tacpipe.io.files import Draft, Hashed, move, present, write_whole
+from tacpipe.io.files import Draft, Hashed, move, present
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, registry
 from tacpipe.plugins import params as params_of
@@ -63,7 +62,7 @@ class SharedFiles:
                         if is_input_error(error):
                             self.store.write_file(failed, str(error).encode())
                         raise
-                    move(name, path)
+                    move(name, path, in_store=True)
         return Path(path)
 
 
@@ -359,7 +358,7 @@ def _prepare_workspace(store: Store, key: str) -> Path:
     folder = workspace(store, key)
     if folder.is_symlink():
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
-    folder.mkdir(parents=True, exist_ok=True)
+    files.make_folder(folder)
     code_file, code = folder / _CODE, provenance.code_of_training().encode()
     try:
         stored = regular.content(code_file, follow=False)
@@ -371,7 +370,7 @@ def _prepare_workspace(store: Store, key: str) -> Path:
             log.warning("The checkpoint in %s was written by other code; training starts over.", folder)
         for path in checkpoints:
             path.unlink(missing_ok=True)
-        write_whole(str(code_file), code, str(folder / f"{_CODE}.{uuid.uuid4().hex}"))
+        store.write_file(code_file, code)
     return folder
 
 

@@ -7,42 +7,117 @@ import errno
 import fnmatch
 import hashlib
 import os
+import pwd
 import re
-from collections.abc import Iterable, Iterator
+import stat
+import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
-from tacpipe.errors import StorageError, UsageError
+from tacpipe.errors import DeniedError, StorageError, UsageError
 
+_T = TypeVar("_T")
 _READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)
 
 
 def write_whole(
-    path: str, content: bytes | Iterable[bytes], draft: str, *, mode: int = 0o666, exclusive: bool = False
+    path: str,
+    content: bytes | Iterable[bytes],
+    draft: str,
+    *,
+    mode: int = 0o666,
+    exclusive: bool = False,
+    in_store: bool = False,
 ) -> bool:
     """Write ``content``, as bytes or blocks, to ``path`` through the file ``draft`` next to it.
 
     A reader of ``path`` sees either the previous content or all of ``content``. With ``exclusive``, an existing file
-    stays and the result is False. Missing folders are created. ``mode`` is reduced by the umask.
+    stays and the result is False. Missing folders are created. ``mode`` is reduced by the umask, or ``in_store`` as
+    `create` states.
     """
     try:
-        _write_synced(draft, content, mode)
-        return move(draft, path, exclusive=exclusive)
+        _write_synced(draft, content, mode, in_store)
+        return move(draft, path, exclusive=exclusive, in_store=in_store)
     finally:
         with contextlib.suppress(OSError):  # a remaining draft is removed later
             os.unlink(draft)  # noqa: PTH108
 
 
-def move(draft: str, path: str, *, exclusive: bool = False) -> bool:
-    """Rename a complete draft to ``path``, creating its folder if necessary.
+def move(draft: str, path: str, *, exclusive: bool = False, in_store: bool = False) -> bool:
+    """Rename a complete draft to ``path``, creating its folder if necessary, ``in_store`` as `make_folder` does.
 
     With ``exclusive``, an existing file stays and the result is False.
     """
+    return _in_folder(path, lambda: _move(draft, path, exclusive), in_store=in_store)
+
+
+def create(path: str | Path, flags: int, mode: int = 0o666) -> int:
+    """Open a file of a store, creating it if ``flags`` permit that, and return its handle.
+
+    In a shared folder, whose group may write and owns what is created in it, a file has the permissions that both
+    ``mode`` and the folder grant, whatever the umask. In other folders ``mode`` is reduced by the umask.
+    """
+    handle = os.open(path, flags, mode)
+    if shared_mode := _shared_mode(path):
+        with contextlib.suppress(OSError):  # the file belongs to another user, who has set its permissions
+            os.fchmod(handle, mode & shared_mode)
+    return handle
+
+
+def make_folder(path: str | Path) -> None:
+    """Create a folder of a store, and its missing parents. In a shared folder, it is shared in the same way."""
     try:
-        return _move(draft, path, exclusive)
+        os.mkdir(path)  # noqa: PTH102
     except FileNotFoundError:
-        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
-        return _move(draft, path, exclusive)
+        parent = os.path.dirname(path)  # noqa: PTH120
+        if not parent:
+            raise
+        make_folder(parent)
+        make_folder(path)
+    except FileExistsError:
+        if not os.path.isdir(path):  # noqa: PTH112
+            raise
+    else:
+        if shared_mode := _shared_mode(path):
+            with contextlib.suppress(FileNotFoundError):  # another process removed the empty folder
+                os.chmod(path, shared_mode)  # noqa: PTH101
+
+
+def _shared_mode(path: str | Path) -> int:
+    """Return the permissions of the folder that contains ``path`` if it is shared, else 0."""
+    mode = os.stat(os.path.dirname(path) or ".").st_mode & 0o2777  # noqa: PTH116, PTH120
+    return mode if mode & SHARED == SHARED else 0
+
+
+SHARED = stat.S_ISGID | stat.S_IWGRP  # permissions by which a folder is shared
+
+
+def patiently(call: Callable[[], _T]) -> _T:
+    """Return the result of ``call``, which is repeated once if permission is denied.
+
+    Another user may have created a file or folder, and share it a moment later.
+    """
+    try:
+        return call()
+    except PermissionError:
+        time.sleep(_SHARING_S)
+        return call()
+
+
+_SHARING_S = 0.02
+
+
+def _in_folder(path: str, call: Callable[[], _T], *, in_store: bool) -> _T:
+    """Return the result of ``call``, which creates ``path``; its folder is created first if it does not exist."""
+    try:
+        return patiently(call) if in_store else call()
+    except FileNotFoundError:
+        folder = os.path.dirname(path)  # noqa: PTH120
+        make_folder(folder) if in_store else os.makedirs(folder, exist_ok=True)  # noqa: PTH103
+        return call()
 
 
 def write_all(handle: int, content: bytes | memoryview) -> None:
@@ -147,7 +222,7 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
 class readable_errors:  # noqa: N801  (a context manager; a generator would take five times as long)
     """Convert file system errors in the block to a sentence, except errors about missing files.
 
-    With ``reading``, nothing is written in the block, and the sentence is that of `read_error`.
+    With ``reading``, nothing is written in the block, and the sentence is that of `read_error`, else of `sentence`.
     """
 
     __slots__ = ("_reading", "_root")
@@ -178,6 +253,12 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
             f"shows what the store could give back) and run the same command again."
         )
     if error.errno in _READ_ONLY:
+        refused = _refused(error.filename2, error.filename, root, writing=True)
+        if refused is not None and refused[1] != os.geteuid():
+            text = (
+                f"The store {root} cannot be written: {_advice(*refused, root)} Or name another one in TACPIPE_STORE."
+            )
+            return DeniedError(text, refused[1])
         return StorageError(
             f"The store {root} cannot be written ({error.strerror}). Make it writable, or name another one in "
             f"TACPIPE_STORE."
@@ -189,11 +270,53 @@ def sentence(root: Path | str, error: OSError) -> StorageError:
 
 
 def read_error(path: Path | str, error: OSError) -> StorageError:
-    """Return an error about a file that the system fails to read, which implies nothing about its content."""
+    """Return an error about a file that the system fails to read, which implies nothing about its content.
+
+    It is a `DeniedError` if permissions exclude this user.
+    """
+    refused = _refused(path) if error.errno in _READ_ONLY else None
+    if refused is not None:
+        return DeniedError(f"{path} cannot be read: {_advice(*refused, path)}", refused[1])
     hint = _hint(error, "check the disk and its permissions")
     return StorageError(
         f"{path} cannot be read: {error.strerror or error}. It may be sound: {hint}, then run the same command again."
     )
+
+
+def _refused(*paths: Path | str | None, writing: bool = False) -> tuple[Path, int] | None:
+    """Return the first file or folder that excludes this user, and its owner; None if all ``paths`` are accessible.
+
+    For each path, the file and the folder that contains it are tried, and all parents as long as nothing is visible.
+    """
+    folder_access = os.R_OK | os.X_OK | (os.W_OK if writing else 0)
+    for path in paths:
+        for place in () if path is None else (Path(path), *Path(path).parents):
+            try:
+                status = place.lstat()
+            except OSError:
+                continue
+            is_folder = stat.S_ISDIR(status.st_mode)
+            if not os.access(place, folder_access if is_folder else os.R_OK):
+                return place, status.st_uid
+            if is_folder:
+                break
+    return None
+
+
+def _advice(refusing: Path, owner: int, path: Path | str) -> str:
+    """Return the owner of a file or folder that refuses access to ``path``, and what this owner can do."""
+    return (
+        f"{'it' if refusing == Path(path) else refusing} belongs to the user {user_name(owner)}, who can run "
+        f"`chmod -R g+rwX` on it, or `tacpipe store init --shared` on the store."
+    )
+
+
+def user_name(user_id: int) -> str:
+    """Return the name of a user, or the id of a user without a name."""
+    try:
+        return pwd.getpwuid(user_id).pw_name
+    except (KeyError, OverflowError):
+        return str(user_id)
 
 
 def _hint(error: OSError, otherwise: str) -> str:
@@ -213,13 +336,10 @@ def describe(error: OSError) -> str:
     )
 
 
-def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int) -> None:
+def _write_synced(path: str, content: bytes | Iterable[bytes], mode: int, in_store: bool) -> None:
     """Write ``content`` to a new file and sync it; its folder is created if necessary."""
-    try:
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    except FileNotFoundError:
-        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    opened = create if in_store else os.open
+    handle = _in_folder(path, lambda: opened(path, _NEW, mode), in_store=in_store)
     try:
         for block in [content] if isinstance(content, bytes) else content:
             write_all(handle, block)
@@ -279,7 +399,7 @@ class Draft(Hashed):
     def __init__(self, path: str, root: Path | str, mode: int) -> None:
         super().__init__()
         self._root = root
-        self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        self._handle = create(path, _NEW, mode)
 
     def write(self, content: bytes | memoryview) -> int:
         """Write all of ``content``. Raises `StorageError` if the disk fails or is full."""
@@ -308,10 +428,10 @@ class Draft(Hashed):
 def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Draft]:
     """Yield a new file at ``path`` in the store ``root``. It is deleted after the block unless it was moved.
 
-    ``mode`` is reduced by the umask. Raises `StorageError` if the file system does not allow it.
+    ``mode`` is that of `create`. Raises `StorageError` if the file system does not allow it.
     """
     try:
-        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        make_folder(os.path.dirname(path))  # noqa: PTH120
         draft = Draft(path, root, mode)
     except OSError as error:
         raise sentence(root, error) from error

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import netrc
 import socket
 import time
+from base64 import b64encode
 from urllib.parse import urlsplit
 
 from tacpipe.errors import DeviceError, UsageError
@@ -28,8 +30,8 @@ Head = dict[str, str]  # fields by lower-case name; "" is the key of the first l
 def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
     """Return the open stream of an address such as ``http://192.168.1.20:8080/?action=stream``.
 
-    Raises `UsageError` for an invalid address, and `DeviceError` for a host that is unknown, unreachable or serves
-    something else.
+    The credentials for its host in ``~/.netrc`` are sent. Raises `UsageError` for an invalid address or file, and
+    `DeviceError` for a host that is unknown, unreachable or serves something else.
     """
     address = urlsplit(place)
     try:
@@ -41,10 +43,11 @@ def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
             f"mjpeg:{plain(place)} names no stream; it should read like mjpeg:http://192.168.1.20:8080/stream."
         )
     path = (address.path or "/") + (f"?{address.query}" if address.query else "")
+    authorization = _authorization(host)
     connection = network.connect(host, port, name)
     try:
-        request = f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\nAccept: multipart/x-mixed-replace\r\n\r\n"
-        connection.sendall(request.encode("ascii", "replace"))
+        head = f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\nAccept: multipart/x-mixed-replace\r\n"
+        connection.sendall(head.encode("ascii", "replace") + authorization + b"\r\n")
         parser, images = MultipartParser(), []
         until_s = time.monotonic() + ANSWER_S
         connection.settimeout(ANSWER_S)
@@ -62,8 +65,29 @@ def open_mjpeg(place: str, sensor: Sensor, name: str) -> MjpegLink:
     if parser.boundary is None:
         connection.close()
         reason = parser.fault or "it ended the connection"
-        raise DeviceError(f"{name}: {place} serves no stream of images: {reason}. Open the address in a browser.")
+        hint = (
+            f"Give the user and password of {host} in ~/.netrc" if " 401" in reason else "Open the address in a browser"
+        )
+        raise DeviceError(f"{name}: {place} serves no stream of images: {reason}. {hint}.")
     return MjpegLink(name, connection, parser, images)
+
+
+def _authorization(host: str) -> bytes:
+    """Return the field of a request with the credentials for a host in ``~/.netrc``, or b"" if there are none."""
+    try:
+        login, _, password = netrc.netrc().authenticators(host) or ("", "", "")
+    except FileNotFoundError:
+        return b""
+    except (
+        OSError,
+        UnicodeDecodeError,
+        netrc.NetrcParseError,
+    ):  # not quoted, because the text could contain a password
+        raise UsageError(
+            "~/.netrc cannot be read. It needs lines such as `machine HOST login USER password PASSWORD`, and "
+            "`chmod 600 ~/.netrc`."
+        ) from None
+    return b"Authorization: Basic " + b64encode(f"{login}:{password}".encode()) + b"\r\n" if login else b""
 
 
 class MultipartParser:

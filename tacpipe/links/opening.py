@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from tacpipe.errors import DeviceError
+from tacpipe.io.credentials import refuse_credentials
 from tacpipe.links import camera, can, folder, hid, lsl, mjpeg, network, ports, v4l2, websocket
 from tacpipe.links.link import Address, Arrived, Link
 from tacpipe.sensors.sensor import Ask, Dialogue, Sensor
@@ -29,11 +30,16 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
 def open_link(address: Address, sensor: Sensor, stream: str) -> Link:
     """Open a link to a sensor. ``stream`` is its name in errors. Nothing is sent to the device; see `run_dialogue`.
 
-    Raises `DeviceError` if the device is missing, busy, not permitted, or refuses the connection.
+    Raises `DeviceError` if the device is missing, busy, not permitted, or refuses the connection, and `UsageError` for an
+    address with credentials.
     """
+    refuse_credentials(str(address), f"Stream {stream}")
+    if address.scheme in HOST_SCHEMES:
+        refuse_credentials(f"//{address.target}", f"Stream {stream}")
     return OPENERS[address.scheme](address.target, sensor, f"Stream {stream} ({address})")
 
 
+HOST_SCHEMES = ("udp", "tcp", "tcp+udp", "ws")  # links whose target begins with a host
 QUOTED = 16  # maximum number of bytes that an error quotes
 
 

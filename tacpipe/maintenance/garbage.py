@@ -8,6 +8,7 @@ other.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import shutil
 import time
@@ -18,7 +19,7 @@ from pathlib import Path
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
-from tacpipe.errors import DamagedError, StorageError, TacpipeError
+from tacpipe.errors import DamagedError, DeniedError, StorageError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
@@ -28,6 +29,7 @@ from tacpipe.store import layout, presence
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import MissingError, Store
 
+log = logging.getLogger(__name__)
 GRACE_DAYS = 14.0  # how long roots with unreachable paths and files in quarantine are retained
 _DRAFT_S = 3600.0  # age in seconds above which a draft counts as abandoned
 _YOUNG_S = 60.0  # age in seconds below which files are not touched
@@ -120,7 +122,8 @@ def _lasting(store: Store, name: str) -> bool:
 def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
     """Remove unneeded content, records before their objects; with ``dry_run``, only count it.
 
-    Only names of the store's own form are considered, and symbolic links are not followed. Raises `LockedError` if
+    Only names of the store's own form are considered, and symbolic links are not followed. If this user may not read a
+    file, no object is removed, because the file may name it. Raises `LockedError` if
     another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
     """
     if not store.check():
@@ -147,12 +150,15 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
             continue
         unneeded.append(key)
     retained |= needed.objects
-    objects = [name for name in layout.names(store.root, "objects") if name not in retained]
+    objects = [name for name in store.names("objects") if name not in retained]
     named_by = {} if recordings else unnamed.irreplaceable(store, objects, needed.manifests)
     retained = retained.union(named_by, *named_by.values())
     collected.records = sum(_remove_record(store.record_path(key), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(retained - needed.objects - needed.replaced - needed.pages - set(named_by))
     moved_names = []
+    if store.denied:
+        log.warning("tacpipe: No object is removed, because it may be named in one of the files that cannot be read.")
+        objects = []
     for name in (name for name in objects if name not in retained):
         path = store.object_path(name)
         if _young(path):
@@ -168,7 +174,8 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         moved_names.sort(
             key=lambda name: name not in root_manifests
         )  # manifests of roots are moved before their objects
-        _remove(store, moved_names, live(store, grace_days).objects, collected)
+        live_objects = live(store, grace_days).objects
+        _remove(store, moved_names, live_objects.union(moved_names if store.denied else ()), collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
 
@@ -176,7 +183,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
 def _summaries(store: Store) -> dict[str, RecordSummary]:
     """Return the summary of each record that is sound, by its key."""
     sound, summaries = SoundRecords(store), {}
-    for key in layout.names(store.root, "records"):
+    for key in store.names("records"):
         with contextlib.suppress(MissingError):
             summaries[key] = sound.read(key)
     sound.remember()
@@ -250,7 +257,8 @@ def _closure(
         except StorageError:  # the disk failed or memory is short, so the manifest's content is unknown
             raise
         except TacpipeError as error:
-            if name in datasets or store.quarantined(name) or store.has(name):  # the manifest existed here once
+            # the manifest existed here once; if something is denied, no object is removed
+            if not store.denied and (name in datasets or store.quarantined(name) or store.has(name)):
                 raise DamagedError(
                     f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
                     "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
@@ -272,10 +280,16 @@ def _doubtful(store: Store) -> dict[Path, set[str]]:
         name, _, kind = path.name.rpartition(".")[0].partition(".")
         if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
             continue
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # a larger file was a shard
-            names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
+        try:
+            with readable_errors(store.root, reading=True):
+                names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
             if names:
                 names_by_path[path] = names | unnamed.named_by_pages(store, names)
+        except (FileNotFoundError, regular.IrregularError):  # a larger file was a shard
+            continue
+        except DeniedError as error:
+            names_by_path[path] = set()
+            store.note_denied(f"quarantine/{path.name}", error)
     return names_by_path
 
 

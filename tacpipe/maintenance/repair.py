@@ -17,9 +17,9 @@ from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.delivery import deliver
 from tacpipe.engine import execution
-from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.errors import DeniedError, StorageError, TacpipeError
 from tacpipe.io import regular
-from tacpipe.io.files import readable_errors, walk, write_whole
+from tacpipe.io.files import read_error, readable_errors, walk, write_whole
 from tacpipe.io.hashing import file_digest
 from tacpipe.maintenance.sound_records import SoundPages, SoundRecords
 from tacpipe.printable import plain
@@ -27,7 +27,7 @@ from tacpipe.store import layout
 from tacpipe.store.leases import Holder
 from tacpipe.store.location import locate
 from tacpipe.store.roots import PUSHED, Root
-from tacpipe.store.store import AbsentError, MissingError, Store
+from tacpipe.store.store import AbsentError, MissingError, Store, UnreadableError
 
 _SHOWN = 10  # number of foreign files listed before the others are counted
 _Measured = Literal["objects", "records", "quarantine", "tmp", "checkpoints"]
@@ -131,12 +131,12 @@ def verify(store: Store) -> Soundness:
     soundness = Soundness(foreign=layout.foreign(store.root))
     present = {
         name
-        for name in layout.names(store.root, "objects")
+        for name in store.names("objects")
         if regular.small_file_digest(store.object_path(name)) == name or _read(store.read, name, soundness)
     }
     soundness.objects = len(present)
     sound = SoundRecords(store)
-    for key in layout.names(store.root, "records"):
+    for key in store.names("records"):
         soundness.records += _read(sound.read, key, soundness)
     sound.remember()
     store.roots.all()
@@ -144,6 +144,7 @@ def verify(store: Store) -> Soundness:
     missing = set(_absent_objects(store, soundness, present)) - set(soundness.damaged)
     # checked twice, because a root may change in between
     soundness.missing = sorted(missing & set(_absent_objects(store, soundness))) if missing else []
+    soundness.unread |= store.denied
     return soundness
 
 
@@ -153,6 +154,8 @@ def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> boo
         read(name)
     except AbsentError:
         return False
+    except UnreadableError as error:
+        soundness.unread[name] = str(error)
     except MissingError:
         soundness.damaged.append(name)
     except StorageError as error:
@@ -271,11 +274,21 @@ def status(store: Store) -> FolderStatus:
 
 
 def _measure_folder(store: Store, name: _Measured) -> FolderSize:
-    """Return number and size of the files in a folder of the store; files that disappear meanwhile are not counted."""
+    """Return number and size of the files in a folder of the store.
+
+    Files that disappear meanwhile and those in folders that this user may not list are not counted.
+    """
     sizes = []
 
-    with readable_errors(store.root):
-        for folder, _, files in walk(store.root / name, links=False):
+    def note_denied(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):
+            failure = read_error(error.filename, error)
+            if not isinstance(failure, DeniedError):
+                raise failure
+            store.note_denied(os.path.relpath(error.filename, store.root), failure)
+
+    with readable_errors(store.root, reading=True):
+        for folder, _, files in os.walk(store.root / name, onerror=note_denied):
             for file in files:
                 with contextlib.suppress(FileNotFoundError):
                     sizes.append(os.lstat(f"{folder}/{file}").st_size)
@@ -322,6 +335,7 @@ def _absent_objects(store: Store, soundness: Soundness, present: Collection[str]
     """Return the paths of missing objects that roots need, by digest: manifests, and everything in those at the paths.
 
     Objects that the system fails to read or to find are noted in ``soundness``. Those in ``present`` were just read.
+    Objects that this user may not read are left out.
     """
     paths_by_digest, sound = {}, SoundPages(store)
     for root in store.roots.all():
@@ -343,4 +357,4 @@ def _absent_objects(store: Store, soundness: Soundness, present: Collection[str]
         except TacpipeError:
             continue
     sound.remember()
-    return paths_by_digest
+    return {name: path for name, path in paths_by_digest.items() if name not in store.denied}

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from tacpipe.datasets.pages import Pages, shard_digests
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
+from tacpipe.io.files import create, make_folder
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout, records
 from tacpipe.store.records import Record
@@ -104,8 +105,9 @@ def _write_lines(store: Store, path: Path, lines: Iterable[bytes]) -> None:
     draft = Path(store.draft())
     with contextlib.suppress(OSError, TacpipeError):
         try:
-            draft.write_bytes(b"%b %b\n%b" % (_FORMAT, bytes_digest(body).encode(), body))
-            path.parent.mkdir(exist_ok=True)
+            with open(draft, "xb", opener=create) as writing:
+                writing.write(b"%b %b\n%b" % (_FORMAT, bytes_digest(body).encode(), body))
+            make_folder(path.parent)
             if not layout.is_linked(str(store.root), path):
                 draft.replace(path)
         finally:

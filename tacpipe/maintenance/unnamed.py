@@ -7,16 +7,14 @@ for a page of a manifest: recordings with raw files, and hand-set labels, are ke
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import MissingPageError, PageContent, StoredPages
-from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.errors import DeniedError, StorageError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
@@ -102,11 +100,21 @@ def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
 
 
 def _objects_with_marks(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of the objects with these names that start with a mark."""
+    """Yield name and content of the objects with these names that start with a mark.
+
+    Objects that this user may not read are noted in the store.
+    """
     for name in names:
         path = store.object_path(name)
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(Path(path), reading=True):
-            with regular.opened(path, follow=False) as file:
-                if not file.read(max(map(len, marks))).startswith(marks):
-                    continue
-            yield name, regular.content(path, regular.JSON_BYTES, follow=False)
+        try:
+            with readable_errors(path, reading=True):
+                with regular.opened(path, follow=False) as file:
+                    if not file.read(max(map(len, marks))).startswith(marks):
+                        continue
+                content = regular.content(path, regular.JSON_BYTES, follow=False)
+        except (FileNotFoundError, regular.IrregularError):
+            continue
+        except DeniedError as error:
+            store.note_denied(name, error)
+            continue
+        yield name, content

@@ -9,20 +9,16 @@ from __future__ import annotations
 import contextlib
 import html
 from collections.abc import Iterator, Mapping
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from threading import Event, Thread
 from urllib.parse import quote, unquote
 
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
+from tacpipe.io.local_pages import HOST, LocalHandler
 from tacpipe.recording.watch import Watch
 from tacpipe.video.images import START
 
-HOST = "127.0.0.1"
-HOSTS = (
-    HOST,
-    "localhost",
-)  # accepted host names, so that a page of another site cannot read the images through its own name
 POLL_S = 0.01  # period of looking for a new frame
 IDLE_S = 0.2  # time without a new frame after which the last one is sent again, to detect that a browser disconnected
 BOUNDARY = "tacpipe-frame"
@@ -61,17 +57,14 @@ def serve_pictures(watches: Mapping[str, Watch], port: int | None) -> Iterator[s
         server.server_close()
 
 
-class PictureHandler(BaseHTTPRequestHandler):
+class PictureHandler(LocalHandler):
     """Answers requests for the page, and for the frames of a camera."""
 
     cameras: Mapping[str, Watch]
     stopping: Event
 
-    def do_GET(self) -> None:
+    def answer(self) -> None:
         """Send the page, or the frames of a camera until the browser disconnects."""
-        if self.headers.get("Host", "").rpartition(":")[0] not in HOSTS:
-            self.send_error(403)
-            return
         name = unquote(self.path.lstrip("/"))
         if not name:
             self._send_page()
@@ -112,6 +105,3 @@ class PictureHandler(BaseHTTPRequestHandler):
                     sent, idle_s = frame, 0.0
                 self.stopping.wait(POLL_S)
                 idle_s += POLL_S
-
-    def log_message(self, *_: object) -> None:
-        """Print nothing."""

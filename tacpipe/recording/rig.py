@@ -24,6 +24,7 @@ from pathlib import Path
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import config_text, regular
+from tacpipe.io.credentials import refuse_credentials
 from tacpipe.links import link
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute, Values
@@ -60,7 +61,7 @@ class Rig:
 
 
 def read(path: Path) -> Rig:
-    """Return the rig that a file describes. Raises `UsageError` with the location of the mistake."""
+    """Return the rig that a file describes. Raises `UsageError` for a mistake, with its location, and for credentials."""
     try:
         text = regular.content(path).decode()
     except TacpipeError as error:
@@ -69,6 +70,7 @@ def read(path: Path) -> Rig:
         raise UsageError(f"The rig file {path} does not exist; its format is documented in docs/rig.md.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"The rig file {path} cannot be read: {error}.") from error
+    refuse_credentials(text, str(path))  # the text is stored with the recordings
     return parse(text, str(path))
 
 

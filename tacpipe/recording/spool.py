@@ -34,7 +34,7 @@ import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
-from tacpipe.io.files import readable_errors, sync_folder, write_whole
+from tacpipe.io.files import make_folder, readable_errors, sync_folder, user_name, write_whole
 from tacpipe.recording import spool_folders
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
@@ -131,7 +131,7 @@ class Spool:
         self.clock = read_clocks()
         spool_folders.refuse_link(store)
         with readable_errors(store):
-            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder.parent)
             self.folder.mkdir(mode=0o700)
             spool_header: spool_folders.SpoolHeader = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
@@ -341,7 +341,7 @@ class Spooled:
         """
         target = self.folder.parent.parent / KEPT
         with readable_errors(target.parent):
-            target.mkdir(mode=0o777, exist_ok=True)
+            make_folder(target)
             if target.is_symlink():
                 raise TacpipeError(f"{target} is a symbolic link. Remove it.")
             self.folder.rename(target / self.folder.name)
@@ -363,8 +363,7 @@ class Spooled:
             regular.require(path, status.st_mode)
             if self._owners is not None and status.st_uid not in self._owners:
                 raise TacpipeError(
-                    f"{path} belongs to another user ({spool_folders.user_name(status.st_uid)}). Only this user can "
-                    f"seal it."
+                    f"{path} belongs to another user ({user_name(status.st_uid)}). Only this user can seal it."
                 )
         except BaseException:
             file.close()

@@ -11,7 +11,6 @@ import errno
 import fcntl
 import math
 import os
-import pwd
 import re
 import stat
 import tempfile
@@ -47,14 +46,6 @@ def own_user_ids(folder: Path, existing: Iterable[int]) -> frozenset[int]:
         with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=folder) as file:
             ids.add(os.fstat(file.fileno()).st_uid)
     return frozenset(ids)
-
-
-def user_name(user_id: int) -> str:
-    """Return the name of a user, or the id of a user without a name."""
-    try:
-        return pwd.getpwuid(user_id).pw_name
-    except (KeyError, OverflowError):
-        return str(user_id)
 
 
 def refuse_link(store: Path) -> None:

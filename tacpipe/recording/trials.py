@@ -14,6 +14,7 @@ from tacpipe.datasets.manifest import ACQUIRE
 from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import termination
+from tacpipe.io.files import user_name
 from tacpipe.io.termination import EndRequest
 from tacpipe.plugins.rows import StageRows
 from tacpipe.plugins.stage import Attribute
@@ -278,5 +279,5 @@ def spools_of_others(store: Store) -> dict[Path, str]:
     with contextlib.suppress(OSError):  # a failed disk has already been reported
         owners = spool_folders.find_owners(store.root)
         own_ids = spool_folders.own_user_ids(store.root / spool_folders.FOLDER, owners.values())
-        return {folder: spool_folders.user_name(owner) for folder, owner in owners.items() if owner not in own_ids}
+        return {folder: user_name(owner) for folder, owner in owners.items() if owner not in own_ids}
     return {}

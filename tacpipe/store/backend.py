@@ -10,7 +10,9 @@ In a folder, drafts are written to ``tmp/``, synced and renamed, and links never
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -18,7 +20,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from tacpipe.errors import StorageError
 from tacpipe.io import regular
-from tacpipe.io.files import read_error, readable_errors, sentence, write_whole
+from tacpipe.io.files import make_folder, read_error, readable_errors, write_whole
 from tacpipe.store import layout
 
 MAX_CONCURRENT = 16  # maximum number of concurrent requests
@@ -128,7 +130,7 @@ class Directory:
         """
         self.refuse_linked(path)
         with readable_errors(self._root):
-            return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive)
+            return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive, in_store=True)
 
     def read(self, name: str, max_bytes: int | None = None) -> bytes:
         """Implement `Backend.read`; raises `StorageError` if the system fails to read the file."""
@@ -149,14 +151,16 @@ class Directory:
             raise read_error(self.path(name), error) from error
 
     def stat(self, name: str) -> Entry | None:
-        """Implement `Backend.stat`; raises `StorageError` if the system fails."""
+        """Implement `Backend.stat`; raises `StorageError` if the system fails, or if this user may not read the file."""
         path = self.path(name)
         try:
             status = os.lstat(path)  # called once per shard, and os is 5 times faster than pathlib
+            if not (status.st_mode & stat.S_IROTH or os.access(path, os.R_OK)):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise sentence(self.place, error) from error
+            raise read_error(path, error) from error
         regular.require(path, status.st_mode)
         return Entry(name, status.st_size, status.st_mtime)
 
@@ -176,7 +180,7 @@ class Directory:
             except FileNotFoundError:
                 if not os.path.lexists(self.path(name)):
                     return False
-                os.makedirs(os.path.dirname(self.path(to)), exist_ok=True)  # noqa: PTH103, PTH120
+                make_folder(os.path.dirname(self.path(to)))  # noqa: PTH120
                 os.rename(self.path(name), self.path(to))  # noqa: PTH104
         return True
 

@@ -10,10 +10,10 @@ import operator
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.errors import DamagedError, DeniedError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
@@ -46,6 +46,8 @@ _FORMS = {  # pattern of the paths in each folder
     PRESENCE: re.compile(_DIGEST),
 }
 _SHELVED = ("objects", "records")
+# a function that is called with the name of each file or folder that this user may not read
+NoteDenied = Callable[[str, DeniedError], object]
 _NAME_LENGTHS = {"objects": 64, "records": 69}  # length of names: a digest, followed by ".json" for a record
 _HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # folders whose entries are folders; others contain files
 _BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may have content before the mark is written
@@ -113,14 +115,17 @@ def entries(root: Path, name: str) -> Iterator[Path]:
     return (Path(path) for path, is_ours in _contents(root, name) if is_ours)
 
 
-def names(root: Path, folder: str) -> Iterator[str]:
-    """Yield the sorted file names in ``objects`` or ``records``, which are digests. Raises the errors of `entries`."""
-    return (path[-_NAME_LENGTHS[folder] :][:64] for path, ours in _contents(root, folder) if ours)
+def names(root: Path, folder: str, note_denied: NoteDenied) -> Iterator[str]:
+    """Yield the sorted file names in ``objects`` or ``records``, which are digests.
+
+    Calls ``note_denied`` for each subfolder that this user may not list. Raises the other errors of `entries`.
+    """
+    return (path[-_NAME_LENGTHS[folder] :][:64] for path, ours in _contents(root, folder, note_denied) if ours)
 
 
 def foreign(root: Path) -> list[str]:
     """Return the sorted relative paths below ``root`` that do not belong to a store, including symbolic links."""
-    paths = [path for name in _FORMS for path, is_ours in _contents(root, name) if not is_ours]
+    paths = [path for name in _FORMS for path, is_ours in _contents(root, name, lambda *_: None) if not is_ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
     paths += [entry.path for entry in _scan(root, root) if entry.name not in expected]
     return sorted(str(Path(path).relative_to(root)) for path in paths)
@@ -141,8 +146,15 @@ def _is_link(path: str | Path) -> bool:
         return False
 
 
-def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
-    """Yield the paths in a folder of the store and in its subfolders, each with whether it belongs to the store."""
+def _raise(_: str, error: DeniedError) -> None:
+    raise error
+
+
+def _contents(root: Path, name: str, note_denied: NoteDenied = _raise) -> Iterator[tuple[str, bool]]:
+    """Yield the paths in a folder of the store and in its subfolders, each with whether it belongs to the store.
+
+    Calls ``note_denied`` for each subfolder that this user may not list.
+    """
     folder = root / name
     if folder.is_symlink():
         yield str(folder), False
@@ -152,7 +164,12 @@ def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
             is_kind = entry.is_dir if name in _HOLD_FOLDERS else entry.is_file
             yield entry.path, is_kind(follow_symlinks=False) and _FORMS[name].fullmatch(entry.name) is not None
         elif SHELF.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
-            for inner in _scan(root, entry.path):
+            try:
+                inner_entries = _scan(root, entry.path)
+            except DeniedError as error:
+                note_denied(f"{name}/{entry.name}", error)
+                continue
+            for inner in inner_entries:
                 form = _FORMS[name].fullmatch(f"{entry.name}/{inner.name}")
                 yield inner.path, inner.is_file(follow_symlinks=False) and form is not None
         else:
@@ -161,7 +178,7 @@ def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
 
 def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
     """Return the entries of a folder sorted by name; an empty list if it does not exist."""
-    with readable_errors(root):
+    with readable_errors(root, reading=True):
         try:
             with os.scandir(folder) as entries:
                 return sorted(entries, key=operator.attrgetter("name"))

@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
-from tacpipe.errors import LockedError, TacpipeError
+from tacpipe.errors import DeniedError, LockedError, TacpipeError
 from tacpipe.io import regular, terminal
-from tacpipe.io.files import readable_errors, write_all
+from tacpipe.io.credentials import without_credentials
+from tacpipe.io.files import create, make_folder, patiently, readable_errors, write_all
 from tacpipe.io.hashing import DIGEST
 from tacpipe.store import layout
 
@@ -66,10 +67,11 @@ class Run:
 
 
 class Leases:
-    """The leases in one folder."""
+    """The leases in one folder. ``note_denied`` is called for those that this user may not read."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, note_denied: layout.NoteDenied) -> None:
         self.folder = folder
+        self._note_denied = note_denied
 
     @contextlib.contextmanager
     def hold(self, key: str, work: str = "", timeout_s: float | None = None) -> Iterator[None]:
@@ -101,7 +103,7 @@ class Leases:
         while handle is None:  # gc may look at the file between its creation and the lock
             handle = _try_lock(path)
         try:
-            with readable_errors(self.folder):
+            with readable_errors(self.folder.parent):
                 write_all(handle, note(manifests=sorted(manifests)) + b"\n")
             announcing = Announcing(path)
             yield announcing
@@ -112,7 +114,7 @@ class Leases:
     def runs(self) -> list[Run]:
         """Return the active runs with their announcements, and remove the leases of dead ones.
 
-        A run without announcements does not use anything yet.
+        A run without announcements does not use anything yet. Leases that this user may not read are left out.
         """
         running = []
         for path in self._files():
@@ -130,6 +132,8 @@ class Leases:
                 os.close(handle)
             except FileNotFoundError:
                 continue
+            except DeniedError as error:
+                self._note_denied(f"leases/{path.name}", error)
         return running
 
     def sweep(self) -> None:
@@ -177,7 +181,7 @@ class Announcing:
         new = [name for name in names if name not in self._read_lease]
         if not new:
             return
-        with readable_errors(os.path.dirname(self.path)):  # noqa: PTH120
+        with readable_errors(Path(self.path).parent.parent):
             if self._handle < 0:
                 try:
                     self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
@@ -220,7 +224,7 @@ def parse_lease(path: Path, content: bytes) -> Run:
 
 def note(**extra: Any) -> bytes:
     """Return the description of a lease's holder as one line of JSON."""
-    command = shlex.join(["tacpipe", *sys.argv[1:]])
+    command = without_credentials(shlex.join(["tacpipe", *sys.argv[1:]]))
     value = {
         "host": platform.node(),
         "pid": os.getpid(),
@@ -317,8 +321,8 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
     On a file system without locks, every caller gets the lock: a lease saves duplicate work, but no result depends on
     it.
     """
-    with readable_errors(path.parent):
-        handle = _open(path, create=create)
+    with readable_errors(path.parent.parent):
+        handle = patiently(lambda: _open(path, is_new=create))
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(handle).st_ino == os.stat(path).st_ino:  # noqa: PTH116  (else it was unlinked meanwhile)
@@ -331,25 +335,25 @@ def _try_lock(path: Path, *, create: bool = True) -> int | None:
         os.close(handle)
         if error.errno == errno.ESTALE:  # another computer on a network file system deleted it in the meantime
             return None
-        with readable_errors(path.parent):
+        with readable_errors(path.parent.parent):
             raise
     os.close(handle)
     return None
 
 
-def _open(path: Path, *, create: bool) -> int:
-    """Return a handle on a lease file; with ``create``, the file and its folder are created if they do not exist.
+def _open(path: Path, *, is_new: bool) -> int:
+    """Return a handle on a lease file; if it ``is_new``, the file and its folder are created if they do not exist.
 
-    Raises `FileNotFoundError` without ``create``, and `PermissionError` if the file can be neither written nor read.
+    Raises `FileNotFoundError` for others, and `PermissionError` if the file can be neither written nor read.
     """
-    flags = os.O_NOFOLLOW | (os.O_CREAT if create else 0)
+    flags = os.O_RDWR | os.O_NOFOLLOW
     try:
-        return os.open(path, os.O_RDWR | flags, 0o666)
+        return create(path, flags | os.O_CREAT) if is_new else os.open(path, flags)
     except FileNotFoundError:
-        if not create:
+        if not is_new:
             raise
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return os.open(path, os.O_RDWR | flags, 0o666)
+        make_folder(path.parent)
+        return create(path, flags | os.O_CREAT)
     except PermissionError as error:
         try:
             # belongs to another user of the store: read-only access is enough to wait for it

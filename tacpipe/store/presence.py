@@ -26,6 +26,7 @@ from pathlib import Path
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
+from tacpipe.io.files import create, make_folder
 from tacpipe.io.hashing import SETTLED_NS, digest
 from tacpipe.store import layout
 from tacpipe.store.roots import name_of
@@ -115,9 +116,9 @@ def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, 
     head_line = json.dumps({**value, "check": digest(value)}).encode() + b"\n"
     file, draft = _file(store, directory), Path(store.draft())
     try:
-        with draft.open("xb") as writing:
+        with open(draft, "xb", opener=create) as writing:
             writing.writelines([head_line, *(content for _, (_, content) in sorted(shelves.items()))])
-        file.parent.mkdir(exist_ok=True)
+        make_folder(file.parent)
         if not layout.is_linked(str(store.root), file):
             draft.replace(file)
     finally:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeGuard
 
+from tacpipe.errors import DeniedError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, digest
@@ -108,14 +110,27 @@ class Roots:
             self.write({**root, "pushed": [manifest, *earlier][:PUSHES]})
 
     def all(self) -> list[Root]:
-        """Return all roots. Damaged ones are quarantined; the next run of their stage writes them again."""
-        roots = (self.read(path) for path in self.store.listed("roots", "*.json"))
-        return [root for root in roots if root is not None]
+        """Return all roots, except for those that this user may not read.
+
+        Damaged ones are quarantined; the next run of their stage writes them again.
+        """
+        return [root for _, root in self._readable()]
+
+    def _readable(self) -> Iterator[tuple[Path, Root]]:
+        """Yield the file of each root, and the root; those that this user may not read are noted in the store."""
+        for file in self.store.listed("roots", "*.json"):
+            try:
+                root = self.read(file)
+            except DeniedError as error:
+                self.store.note_denied(f"roots/{file.name}", error)
+                continue
+            if root is not None:
+                yield file, root
 
     def remove(self, root: Root) -> None:
         """Remove a root returned by `all`, whatever the name of its file."""
-        for file in self.store.listed("roots", "*.json"):
-            if self.read(file) == root:
+        for file, stored_root in self._readable():
+            if stored_root == root:
                 with readable_errors(self.store.root):
                     file.unlink(missing_ok=True)
 

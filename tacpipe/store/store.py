@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import os
 import shutil
 import sys
@@ -13,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tacpipe.errors import DamagedError, StorageError, TacpipeError
+from tacpipe.errors import FAILED, DamagedError, DeniedError, StorageError, TacpipeError
 from tacpipe.io import files, memory, regular, terminal
 from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, digest
@@ -32,9 +33,18 @@ from tacpipe.store.records import (
 )
 from tacpipe.store.roots import Roots
 
+log = logging.getLogger(__name__)
+_warned: set[tuple[str, int]] = set()  # store and user id of the owner of each warning about permissions
+
 
 class MissingError(DamagedError):
     """An object is not in the store, or it was damaged and has been quarantined."""
+
+
+class UnreadableError(MissingError):
+    """The permissions of an object or record exclude this user, for whom it is missing. It may be sound."""
+
+    exit_code = FAILED
 
 
 class AbsentError(MissingError):
@@ -67,7 +77,8 @@ class Store:
         self.root = Path(root)
         self._root = str(root)
         self.files = Directory(root, self.draft)
-        self.leases = Leases(self.root / "leases")
+        self.denied: dict[str, str] = {}  # what this user may not read: message by digest, key or path in the store
+        self.leases = Leases(self.root / "leases", self.note_denied)
         self.roots = Roots(self)
         self._run = Announcing(run) if run else None
 
@@ -95,8 +106,9 @@ class Store:
         if self.check():
             return
         with readable_errors(self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
             for name in layout.FOLDERS:
-                (self.root / name).mkdir(parents=True, exist_ok=True)
+                files.make_folder(f"{self._root}/{name}")
             self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
             sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
         if self.root.name == layout.BESIDE_NAME:  # the default store, not one that the user named
@@ -125,6 +137,13 @@ class Store:
             for path in layout.entries(self.root, "tmp"):
                 if path.name.startswith(f"{Path(self.run).stem}."):
                     path.unlink(missing_ok=True)
+
+    def note_denied(self, name: str, error: DeniedError) -> None:
+        """Note that this user may not read a file or folder of the store, and warn of the first one of each owner."""
+        if (self._root, error.owner) not in _warned:
+            _warned.add((self._root, error.owner))
+            log.warning("tacpipe: %s Until then it counts as missing.", error)
+        self.denied.setdefault(name, str(error))
 
     def close(self) -> None:
         """Close all files, so that opening a store for each of many tasks does not exhaust file handles."""
@@ -166,13 +185,16 @@ class Store:
     def _exists(self, name: str, size: int | None = None) -> bool:
         """Return whether an object exists and has this size in bytes; one that a collection moved aside is put back.
 
-        A path that is not a regular file is quarantined.
+        A path that is not a regular file is quarantined. An object that this user may not read counts as missing.
         """
         try:
             entry = self.files.stat(layout.object_name(name))
         except regular.IrregularError:
             self.quarantine(self.object_path(name))
             return self._put_back(name)
+        except DeniedError as error:
+            self.note_denied(name, error)
+            return False
         if entry is None:
             return self._put_back(name)
         return size is None or entry.bytes == size
@@ -221,7 +243,7 @@ class Store:
             if durable or not self._exists(name, draft.bytes):  # an existing copy may be damaged
                 self.files.refuse_linked(self.object_path(name))
                 with readable_errors(self.root):
-                    move(path, self.object_path(name))
+                    move(path, self.object_path(name), in_store=True)
         if durable:
             self.sync(self.object_path(name))
         return Object(name, draft.bytes)
@@ -245,8 +267,9 @@ class Store:
         """Return the verified content of an object; ``size`` is the size in bytes declared by its manifest or record.
 
         Raises `MissingError` if it does not exist, is much larger than declared, or does not match its digest; damaged
-        bytes are moved to ``quarantine/``. Raises `StorageError` if the system fails to read it (EIO, EMFILE, EACCES,
-        …) or memory is short, which implies nothing about the object.
+        bytes are moved to ``quarantine/``. Raises `UnreadableError` if its permissions exclude this user. Raises
+        `StorageError` if the system fails to read it (EIO, EMFILE, …) or memory is short, which implies nothing about
+        the object.
         """
         return self._read(name, size)
 
@@ -260,6 +283,8 @@ class Store:
             raise self._absent_error(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
+        except DeniedError as error:
+            raise self._unreadable(name, error) from error
         if bytes_digest(content) != name:
             raise self._damaged_error(name)
         return content
@@ -276,8 +301,15 @@ class Store:
             raise self._absent_error(name) from None
         except regular.IrregularError as error:
             raise self._irregular(name, error) from error
+        except DeniedError as error:
+            raise self._unreadable(name, error) from error
         if hashed.hexdigest() != name:
             raise self._damaged_error(name)
+
+    def _unreadable(self, name: str, error: DeniedError) -> UnreadableError:
+        """Note that this user may not read an object or record, and return the error about it."""
+        self.note_denied(name, error)
+        return UnreadableError(str(error))
 
     def _absent_error(self, name: str) -> AbsentError:
         return AbsentError(f"Object {name[:12]} is not in the store {self._root}.")
@@ -300,7 +332,7 @@ class Store:
         kind = "root-" if Path(path).parent.name == "roots" else ""
         target = self.root / "quarantine" / f"{kind}{Path(path).name}.{time.time_ns()}"
         try:
-            target.parent.mkdir(exist_ok=True)
+            files.make_folder(target.parent)
             Path(path).replace(target)
         except FileNotFoundError:  # another process moved it
             return True
@@ -360,10 +392,17 @@ class Store:
         """
         return f"{self._root}/tmp/{os.path.basename(self.run).removesuffix('.lock')}.{name or uuid.uuid4().hex}"  # noqa: PTH119
 
+    def names(self, folder: str) -> Iterator[str]:
+        """Yield the sorted digests in ``objects`` or ``records``. Raises the errors of `layout.names`."""
+        return layout.names(self.root, folder, self.note_denied)
+
     # ---- records
 
     def record(self, key: str) -> Record | None:
-        """Return the record of ``key``, or None if there is none or it is damaged. A damaged one is quarantined."""
+        """Return the record of ``key``, or None if there is none or it is damaged or unreadable.
+
+        A damaged one is quarantined.
+        """
         try:
             return self.read_record(key)
         except MissingError:
@@ -372,7 +411,8 @@ class Store:
     def read_record(self, key: str) -> Record:
         """Return the record of ``key``.
 
-        Raises `AbsentError` if there is none, and `MissingError` if it is damaged; it is then in ``quarantine/``.
+        Raises `AbsentError` if there is none, `UnreadableError` if its permissions exclude this user, and `MissingError`
+        if it is damaged; it is then in ``quarantine/``.
         """
         path = self.record_path(key)
         try:
@@ -384,6 +424,8 @@ class Store:
                 return record
         except FileNotFoundError:
             raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
+        except DeniedError as error:
+            raise self._unreadable(key, error) from error
         except StorageError:  # the disk failed, which implies nothing about the record
             raise
         except (ValueError, KeyError, TypeError, RecursionError, TacpipeError):
@@ -402,13 +444,14 @@ class Store:
     ) -> Record:
         """Record ``result`` for ``identity`` and return the valid record; the first of several processes wins.
 
-        With ``replace``, an existing record, which names missing objects, is replaced.
+        With ``replace``, an existing record, which names missing objects, is replaced. A damaged or unreadable one always
+        is.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)
         path = self.record_path(key)
-        for _ in range(2):  # twice, because the existing record may be damaged
-            if self.write_file(path, content, exclusive=not replace):
+        for is_exclusive in (not replace, False):
+            if self.write_file(path, content, exclusive=is_exclusive):
                 break
             existing = self.record(key)
             if existing is not None:
@@ -431,7 +474,7 @@ class Store:
 
     def records(self) -> Iterator[tuple[str, Record]]:
         """Yield every key and its record."""
-        for key in layout.names(self.root, "records"):
+        for key in self.names("records"):
             record = self.record(key)
             if record is not None:
                 yield key, record

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Scalar
+from tacpipe.io.credentials import without_credentials
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
@@ -53,8 +54,8 @@ class MLflow:
         self._uri = place or os.environ.get("MLFLOW_TRACKING_URI") or MLFLOW_DATABASE
         if self._uri.startswith("sqlite:") and importlib.util.find_spec("sqlalchemy") is None:
             raise TacpipeError(
-                f"MLflow needs the package mlflow to write {self._uri}, and mlflow-skinny is installed. Install mlflow, or "
-                f"give a server, as --track mlflow:http://127.0.0.1:5000."
+                f"MLflow needs the package mlflow to write {without_credentials(self._uri)}, and mlflow-skinny is "
+                f"installed. Install mlflow, or give a server, as --track mlflow:http://127.0.0.1:5000."
             )
         self._client = MlflowClient(self._uri)
         self._run = ""
@@ -81,7 +82,7 @@ class MLflow:
             self._run = self._client.create_run(experiment, run_name=name, tags={MLFLOW_TAG: name}).info.run_id
             logged_params = [Param(key, str(value)[:MAX_PARAM_LENGTH]) for key, value in params.items()]
             self._client.log_batch(self._run, params=logged_params)
-        return f"run {name} of experiment {experiment_name} at {self._uri}"
+        return f"run {name} of experiment {experiment_name} at {without_credentials(self._uri)}"
 
     def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
         """Add the metrics of an epoch that the run lacks."""

@@ -17,6 +17,7 @@ from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json, Scalar, terminal
+from tacpipe.io.credentials import refuse_credentials, without_credentials
 from tacpipe.io.hashing import digest
 from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
@@ -108,10 +109,12 @@ _DIGITS = 8  # number of digits of a key that make a run's name unique
 def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
     """Return the trackers in ``--track`` options such as ``mlflow`` or ``mlflow:http://127.0.0.1:5000``.
 
-    Raises `UsageError` for an unknown tracker, and `MissingModuleError` if its extra is not installed.
+    Raises `UsageError` for an unknown tracker or a place with credentials, and `MissingModuleError` if its extra is not
+    installed.
     """
     trackers = {}
     for text in options:
+        refuse_credentials(text, "--track")
         name, _, place = text.partition(":")
         with extras.explain_missing(f"The tracker {name}"):
             trackers[text] = registry.load_tracker(name)(place)
@@ -223,7 +226,7 @@ class Tracking:
         except (Exception, SystemExit) as error:  # third-party clients may raise anything
             del self.trackers[option]
             text = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            first = text.strip().splitlines()[0] if text.strip() else type(error).__name__
+            first = without_credentials(text.strip().splitlines()[0]) if text.strip() else type(error).__name__
             sentence = f"the tracker {option} failed and is left out ({first[:300]})"
             terminal.report_progress(f"{sentence}; the command continues.")
             self.failures.append(f"{sentence}.")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NotRequired, Protocol, TypedDict
 
 from tacpipe.io import terminal, termination
+from tacpipe.io.files import create
 
 HISTORY = "history.jsonl"
 
@@ -178,7 +179,7 @@ class _HistoryFile:
         if self._handle is None and not self._failed:
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
             with self._tolerate_errors():
-                self._handle = os.open(self._path, flags, 0o666)
+                self._handle = create(self._path, flags)
         for line in history:
             self.line(line, 0.0)
 

@@ -26,7 +26,7 @@ from torch.optim.adam import adam
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
-from tacpipe.io.files import readable_errors, sync_folder, write_whole
+from tacpipe.io.files import make_folder, readable_errors, sync_folder, write_whole
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.models.tensors import tensors_under
 from tacpipe.training import following
@@ -115,10 +115,10 @@ def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], history: Seque
     content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": state})
     signed = bytes_digest(content).encode() + b"\n" + content
     with readable_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         draft = folder / f"{FILE}.draft"
         draft.unlink(missing_ok=True)  # a killed run may have left a draft
-        write_whole(str(folder / FILE), signed, str(draft))
+        write_whole(str(folder / FILE), signed, str(draft), in_store=True)
         sync_folder(str(folder))
 
 

@@ -18,7 +18,7 @@ import time
 import urllib.request
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -27,6 +27,7 @@ from urllib.parse import quote
 import numpy as np
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io.local_pages import HOST, LocalHandler
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer import stream
 from tacpipe.viewer.contents import DrawnContents
@@ -86,7 +87,7 @@ def application(dataset: str, number: int) -> str:
     return name if not number else f"{name}-{number + 1}"
 
 
-HOST, PORT = "127.0.0.1", 9090
+PORT = 9090
 POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data: http://localhost:* http://127.0.0.1:*"
@@ -94,10 +95,10 @@ POLICY = (
 TIMEOUT_S = 60.0  # timeout for the viewer's page
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(LocalHandler):
     source = ""
 
-    def do_GET(self) -> None:
+    def answer(self) -> None:
         """Forward the response of the viewer's own server, with the policy."""
         try:
             with urllib.request.urlopen(self.source + self.path, timeout=TIMEOUT_S) as response:
@@ -112,9 +113,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         with suppress(OSError):  # the browser may have disconnected
             self.wfile.write(content)
-
-    def log_message(self, *_: object) -> None:
-        """Suppress log messages."""
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -15,6 +16,7 @@ from tacpipe.links import mjpeg
 from tacpipe.links.link import LinkLostError, parse
 from tacpipe.links.mjpeg import MultipartParser
 from tacpipe.links.opening import open_link
+from tacpipe.recording import rig
 from tacpipe.sensors.camera import Camera, unpack_frame, unpack_settings
 from tacpipe.video.images import ImageShape, read_shape
 from tests.video import videos
@@ -34,14 +36,16 @@ def response(images: list[bytes], *, sized: bool = True, stamped: bool = False) 
 
 
 @contextmanager
-def serve(content: bytes) -> Iterator[str]:
-    """Serve ``content`` to one host and close the connection; yield the address."""
+def serve(content: bytes, requests: list[bytes] | None = None) -> Iterator[str]:
+    """Serve ``content`` to one host and close the connection; yield the address. Its request is added to ``requests``."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
             connection, _ = server.accept()
             with connection:
-                connection.recv(4096)
+                request = connection.recv(4096)
+                if requests is not None:
+                    requests.append(request)
                 connection.sendall(content)
 
         thread = threading.Thread(target=answer, daemon=True)
@@ -116,3 +120,49 @@ def test_a_padded_image_is_whole_and_a_cut_one_is_none(images: list[bytes]) -> N
     assert read_shape(images[0] + bytes(100)) == read_shape(images[0])
     assert read_shape(images[0][: len(images[0]) // 2]) is None
     assert read_shape(b"") is None
+
+
+SECRET_PLACES = [
+    "mjpeg:http://lee:hidden@127.0.0.1:8080/stream",
+    "mjpeg:http://hidden@127.0.0.1/",
+    "mjpeg:http://127.0.0.1/stream?user=lee&pwd=hidden",
+    "ws:lee:hidden@127.0.0.1:5000",
+    "tcp:lee:hidden@127.0.0.1:5000",
+]
+
+
+@pytest.mark.parametrize("place", SECRET_PLACES)
+def test_an_address_with_credentials_is_refused_without_printing_them(place: str, tmp_path: Path) -> None:
+    sensor = Camera()
+    with pytest.raises(UsageError, match="user name, a password or a token") as opened:
+        open_link(parse(place), sensor, "gel")
+    rig_path = tmp_path / "rig.toml"
+    rig_path.write_text(f'[[stream]]\nname = "gel"\nsensor = "camera"\ntransport = "mjpeg:{place.partition(":")[2]}"\n')
+    assert "hidden" not in str(opened.value)
+    if "//" in place:
+        with pytest.raises(UsageError, match="has an address that contains a user name") as read:
+            rig.read(rig_path)
+        assert "hidden" not in str(read.value)
+
+
+def test_the_credentials_of_netrc_are_sent_to_their_host_only(
+    images: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    netrc_path = tmp_path / ".netrc"
+    for host, expected in (("127.0.0.1", b"Authorization: Basic bGVlOmhpZGRlbg=="), ("other.example", None)):
+        netrc_path.write_text(f"machine {host} login lee password hidden\n")
+        netrc_path.chmod(0o600)
+        requests: list[bytes] = []
+        with serve(response(images), requests) as place:
+            open_link(parse(place), Camera(), "gel").close()
+        fields = requests[0].split(b"\r\n")
+        assert [field for field in fields if field.startswith(b"Authorization")] == ([expected] if expected else [])
+
+
+def test_a_netrc_that_cannot_be_read_is_not_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / ".netrc").write_text("machine 127.0.0.1 hidden\n")
+    with pytest.raises(UsageError, match="cannot be read") as error:
+        open_link(parse("mjpeg:http://127.0.0.1:9/"), Camera(), "gel")
+    assert "hidden" not in str(error.value)

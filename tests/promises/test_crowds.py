@@ -27,6 +27,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="pr
 CROWDS = [8, pytest.param(32, marks=pytest.mark.faults)]
 ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 GROUP, USERS = 54321, (54322, 54323)
+UMASKS = {54322: "002", 54323: "022", 54324: "077"}  # umask by user
 ELSEWHERE = 'hostname elsewhere && mkdir -p "$1" && mount --bind "$2" "$1" && shift 2 && exec "$@"'
 UNSHARED = ["unshare", "--uts", "--mount", "--pid", "--fork"]
 
@@ -274,3 +275,84 @@ def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
         kills.make_old(shared.project)
         run_by_users("store gc", first=first)
     tidy(Store(shared.project / ".tacpipe"))
+
+
+def run_as(shared: Scene, user: int, words: str, code: int = 0) -> str:
+    """Run a command of a user in the user's folder of the project; return what it printed."""
+    command = f"{words} --jobs 1" if words.startswith(("simulate", "scale")) else words
+    running = shared.start(command, TEST_USER=str(user), TEST_UMASK=UMASKS[user])
+    assert kills.wait_for_exit(running) == code, (user, words, running.out.read_text())
+    return running.out.read_text()
+
+
+@pytest.fixture
+def three_users(shared: Scene) -> Scene:
+    """A project with a folder of each user, and no store yet."""
+    for user in UMASKS:
+        folder = shared.project / f"data/{user}"
+        folder.mkdir(parents=True)
+        os.chown(folder, user, GROUP)
+        folder.chmod(0o755)
+    return shared
+
+
+@pytest.mark.skipif(not ROOT, reason="only root can be several users")
+def test_users_with_any_umask_share_a_store(three_users: Scene) -> None:
+    root, users = three_users.project / ".tacpipe", list(reversed(UMASKS))
+    first = users[0]
+    line = run_as(three_users, first, f"store init --shared {root}").splitlines()[-1]
+    assert line.startswith(f"{root} is shared with the group ") and "(mode 277" in line
+    for factor in range(3):
+        for user in [*users[factor:], *users[:factor]]:
+            data = f"data/{user}"
+            if not factor:
+                run_as(three_users, user, f"simulate toy --trials 4 --rows 4 -o {data}/r")
+            run_as(three_users, user, f"scale {data}/r --factor {factor} -o {data}/s{factor}")
+            run_as(three_users, user, f"label {data}/r trial-000 --label material=foam{factor}")
+        kills.make_old(three_users.project)
+        run_as(three_users, users[factor], "store gc --grace-days 0")
+        assert "all sound" in run_as(three_users, users[factor - 1], "store verify")
+        assert f"data/{first}/s{factor}" in run_as(three_users, users[factor - 2], "store status")
+    for name in ("s0", "s1", "s2"):
+        manifests = {(three_users.project / f"data/{user}/{name}/manifest.json").read_bytes() for user in UMASKS}
+        assert len(manifests) == 1, name
+    records = {path: path.stat() for path in root.glob("records/*/*")}
+    assert len({status.st_uid for status in records.values()}) == 3, "the users wrote no records in turn"
+    for path in (root, *root.rglob("*")):
+        required = 0o2070 if path.is_dir() else 0o040
+        assert path.stat().st_mode & required == required and path.stat().st_gid == GROUP, path
+    tidy(Store(root))
+
+
+@pytest.mark.skipif(not ROOT, reason="only root can be several users")
+@pytest.mark.parametrize("kind", ["files", "folders"])
+def test_what_a_user_may_not_read_counts_as_missing_until_its_owner_shares_it(three_users: Scene, kind: str) -> None:
+    root, (reader, owner, _) = three_users.project / ".tacpipe", UMASKS
+    run_as(three_users, reader, f"store init --shared {root}")
+    run_as(three_users, reader, f"simulate toy --trials 4 --rows 4 -o data/{reader}/r")
+    run_as(three_users, owner, f"scale data/{reader}/r -o data/{owner}/s")
+    paths = [path for path in root.rglob("*") if path.stat().st_uid == owner]
+    closed = [path for path in paths if (path.is_dir() if kind == "folders" else path.is_file())]
+    for path in closed:
+        path.chmod(0o700 if path.is_dir() else 0o600)
+    kills.make_old(three_users.project)
+    objects = sorted(root.glob("objects/*/*"))
+    printed = run_as(three_users, reader, "store gc --grace-days 0")
+    assert f"belongs to the user {owner}" in printed and "store init --shared" in printed
+    assert sorted(root.glob("objects/*/*")) == objects
+    printed = run_as(three_users, reader, "store verify", code=1)
+    assert "damaged:" not in printed and "missing:" not in printed and f"belongs to the user {owner}" in printed
+    run_as(three_users, reader, "store status")
+    words = f"scale data/{reader}/r -o data/{reader}/s"
+    if kind == "files":
+        assert "4 ran" in run_as(three_users, reader, words)
+        assert "4 reused" in run_as(three_users, reader, words)
+    else:
+        printed = run_as(three_users, reader, words, code=1)
+        assert "cannot be written" in printed and f"belongs to the user {owner}" in printed
+    run_as(three_users, owner, f"store init --shared {root}")
+    assert "all sound" in run_as(three_users, reader, "store verify")
+    assert "4 reused" in run_as(three_users, reader, words)
+    manifests = [(three_users.project / f"data/{user}/s/manifest.json").read_bytes() for user in (reader, owner)]
+    assert manifests[0] == manifests[1]
+    assert not [path for path in root.rglob("*") if path.stat().st_mode & 0o040 == 0]

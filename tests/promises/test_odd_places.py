@@ -386,3 +386,11 @@ def test_an_object_that_cannot_be_read_is_made_again_or_told_in_a_sentence(
     bad.clear()  # Another cable may end the errors.
     assert all(project.served().values())
     check_healing(project)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="nobody may write to /proc")
+@pytest.mark.parametrize("output", ["/proc/x", "/proc/x/y", "/dev/null/x"])
+def test_a_command_whose_output_cannot_be_written_leaves_no_root(lab: Lab, output: str) -> None:
+    assert lab.call(f"simulate toy --jobs 1 -o {output}").code in (1, 2)
+    assert lab.store.roots.all() == []
+    assert "cannot be reached" not in lab.run("store status").out

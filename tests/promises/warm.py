@@ -86,7 +86,7 @@ def _become(folder: str, words: str, out: str, environment: Mapping[str, str]) -
         os.setgroups([])
         os.setgid(int(environment["TEST_GROUP"]))
         os.setuid(int(environment["TEST_USER"]))
-        os.umask(0o002)
+        os.umask(int(environment.get("TEST_UMASK", "002"), 8))
         sys.path = [path for path in sys.path if os.access(path, os.R_OK)]  # the interpreter may be root's alone
     sys.argv = ["tacpipe", *shlex.split(words)]
     from tacpipe.cli import main as cli

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tacpipe.recording import spool_folders
+from tacpipe.io.files import user_name
 from tests.conftest import Lab
 from tests.recording import force_rig, live
 from tests.recording.scripted import Script
@@ -158,7 +158,7 @@ def test_spools_of_other_users_are_neither_sealed_nor_removed(lab: Lab, monkeypa
     monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: (_ for _ in ()).throw(PermissionError()))
     ran = lab.run("acquire --recover")
 
-    mine = spool_folders.user_name(folder.stat().st_uid)
+    mine = user_name(folder.stat().st_uid)
     for spool in (folder, unfinished):
         assert f"The spool {spool} belongs to {mine}. Only this user can seal it.\n" in ran.err
         assert (spool / "bytes").exists()

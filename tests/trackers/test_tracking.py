@@ -233,3 +233,12 @@ def test_tracking_goes_with_no_run_that_stores_nothing(lab: Lab) -> None:
     (lab.folder / "m").mkdir()
     for option in ("--check", "--recompute-and-compare"):
         assert lab.call(f"evaluate m r -o x --track tensorboard {option}").code == 2
+
+
+@pytest.mark.parametrize(
+    "place", ["http://lee:hidden@lab:5000", "postgresql://lee:hidden@lab/runs", "http://lab/?token=hidden"]
+)
+def test_a_place_with_credentials_is_refused_without_printing_them(place: str) -> None:
+    with pytest.raises(UsageError, match="--track has an address") as error:
+        tracking.open_trackers([f"mlflow:{place}"])
+    assert "hidden" not in str(error.value)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from tacpipe.engine import provenance
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory, termination
+from tacpipe.io.credentials import refuse_credentials
 from tacpipe.plugins import registry
 from tacpipe.training import devices
 
@@ -242,7 +243,9 @@ class ChosenExecutor:
 
     def __init__(self, executor: str, jobs: int) -> None:
         """Select an executor: ``NAME`` or ``NAME://ADDRESS``, or the default if empty. Raises `UsageError`."""
-        name, _, self._address = (executor or os.environ.get(VARIABLE, "") or LOCAL).partition("://")
+        text = executor or os.environ.get(VARIABLE, "") or LOCAL
+        refuse_credentials(text, "The executor")
+        name, _, self._address = text.partition("://")
         self._jobs = jobs
         self._connect = registry.load_executor(name)
         self._stack = ExitStack()
