@@ -280,7 +280,19 @@ class ArrayMember:
     @property
     def is_pictures(self) -> bool:
         """Whether the array is images with more values than a table has columns."""
-        return self.video_format is not None and (self.width or 0) > STREAM_COLUMNS
+        return self.video_format is not None and self.is_wide
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether a row has more values than a table has columns."""
+        return (self.width or 0) > STREAM_COLUMNS
+
+    def describe_wide(self) -> str:
+        """Return a phrase about an array whose rows have too many values for columns."""
+        shape = " x ".join(map(str, self.row_shape))
+        return (
+            f"{plain(self.name)} of {shape} values ({self.dtype}) per row, which are no channels; images must be uint8"
+        )
 
     @contextlib.contextmanager
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:

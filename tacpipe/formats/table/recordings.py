@@ -33,6 +33,7 @@ from tacpipe.formats.table.reading import (
     stream_batches,
 )
 from tacpipe.io import files as file_system
+from tacpipe.plugins import failures
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 from tacpipe.video.files import IMAGE_CODECS
@@ -140,8 +141,9 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     read.
     """
     try:
-        container = open_container(kind, path)
-        return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
+        with failures.naming_source([path]):
+            container = open_container(kind, path)
+            return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
             raise
@@ -177,9 +179,10 @@ def _refuse_unmatched(layout: Layout, matched: Mapping[str, Sized], candidates: 
     """Raise `UsageError` if no file matches the pattern of a required stream."""
     for stream in layout.streams:
         if not matched[stream.name] and not stream.optional:
+            images = f"; images are files of {', '.join(IMAGE_CODECS)}" if stream.camera == "images" else ""
             raise UsageError(
                 f"No file below {folder} matches {plain(stream.files, 120)} of [streams.{stream.name}]. There are "
-                f"{len(candidates)} files, as {listed(candidates, 3)}; patterns start from {folder}."
+                f"{len(candidates)} files, as {listed(candidates, 3)}; patterns start from {folder}{images}."
             )
 
 
@@ -227,7 +230,8 @@ def _parts_of_file(path: Path, stream: StreamLayout, stamps_path: Path | None) -
     A file with wrong stamps is one recording, whose reading reports them.
     """
     try:
-        count = check_stamps(rows.open_rows(path, stream), stream, stamps_path).parts
+        with failures.naming_source([path]):
+            count = check_stamps(rows.open_rows(path, stream), stream, stamps_path).parts
     except TacpipeError as error:
         if not is_input_error(error):
             raise
