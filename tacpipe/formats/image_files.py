@@ -60,9 +60,6 @@ def expect_complete(path: Path) -> None:
     else:
         has_header = content.startswith(b"RIFF") and content[8:12] == b"WEBP"
         has_end = int.from_bytes(content[4:8], "little") + 8 <= len(content)
-    if not has_header:
-        raise TacpipeError(
-            f"{path} is not a file of the kind {path.suffix}. Copy it again from its source, or leave it out."
-        )
-    if not has_end:
-        raise TacpipeError(f"{path} is cut off. Copy it again from its source, or leave it out.")
+    if not has_header or not has_end:
+        fault = "is cut off" if has_header else f"is no {path.suffix} image"
+        raise TacpipeError(f"{path} {fault}. Copy it again from its source, or leave it out.")
