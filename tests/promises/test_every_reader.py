@@ -826,7 +826,7 @@ def _overlong_number(write: Callable[[Path], object], name: str) -> Callable[[Pa
     return overlong
 
 
-def _points_claimed(folder: Path) -> None:
+def _many_points(folder: Path) -> None:
     grasp_files.write_grasp(folder)
     path = next(path for path in sorted(folder.rglob("*.pcd")) if path.is_file())
     path.write_bytes(re.sub(rb"POINTS \d+", b"POINTS 1000000000000", path.read_bytes()))
@@ -874,7 +874,7 @@ DECLARED: dict[str, list[Case] | str] = {
         )
     ],
     "gelsight-slip": "packets are no larger than their file, and frames have a largest size",
-    "vision2tactile": [Case(_points_claimed, ".pcd")],
+    "vision2tactile": [Case(_many_points, ".pcd")],
     "xela-flat": [
         Case(
             _overlong_number(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"),

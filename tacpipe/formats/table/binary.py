@@ -28,6 +28,7 @@ from tacpipe.formats.table import text
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
+from tacpipe.plugins import failures
 from tacpipe.printable import listed, plain
 from tacpipe.video.images import PICTURE, array_format, raw_images
 from tacpipe.video.stream import VideoFormat
@@ -62,15 +63,13 @@ class ParquetFile:
 
         Raises `TacpipeError` if it is damaged.
         """
-        try:
-            require_claims(self.path, list(types), rows=min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types))))
+        rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
+        with failures.naming_source([self.path]):
+            require_claims(self.path, list(types), rows=rows)
             with regular.opened(self.path) as file:
                 opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False, page_checksum_verification=True)
-                rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
                 for batch in opened.iter_batches(rows, columns=list(types)):
                     yield _refuse_nested(self.path, pa.Table.from_batches([batch]))
-        except BROKEN as error:
-            raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
 
     def place(self, index: int) -> str:
         """Return the name of the data row ``index`` (from 0) in errors."""

@@ -199,7 +199,12 @@ def read_sample(path: Path) -> FileSample:
     kind = EXTENSIONS[extension(path)]
     if kind == "csv":
         encoding = detect_encoding(path)
-        text = detect_dialect(first_lines(path, encoding))
+        try:
+            text = detect_dialect(first_lines(path, encoding))
+        except csv.Error as error:
+            raise TacpipeError(
+                f"{path} is not a table: {error}. Copy it again from its source, or leave it out."
+            ) from error
         column_names.expect_short(text.names, path)
         columns = list(zip(*text.rows, strict=True)) or [()] * len(text.names)
         values = {

@@ -250,19 +250,20 @@ def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
 
     if stream.contained:
         return {name for name in _episodes(str(stream.format), path)[0] if name is not None} or None
-    file = rows.open_rows(path, stream)
-    if stream.recording not in file.names():
-        raise TacpipeError(
-            f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
-        )
     names_in_file: set[str] = set()
-    for block in file.batches({stream.recording: pa.string()}):
-        names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
-        if None in names or "" in names:
+    with failures.naming_source([path]):
+        file = rows.open_rows(path, stream)
+        if stream.recording not in file.names():
             raise TacpipeError(
-                f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or remove the row."
+                f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
             )
-        names_in_file |= set(names)
+        for block in file.batches({stream.recording: pa.string()}):
+            names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
+            if None in names or "" in names:
+                raise TacpipeError(
+                    f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or remove the row."
+                )
+            names_in_file |= set(names)
     return names_in_file
 
 
