@@ -246,7 +246,7 @@ _ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # name, and the meaning for
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", ColumnMeaning("joint_velocity", "rad/s")),
     (rf"{_ANY}(?:joint_torques?|tau)", ColumnMeaning("joint_torque", "N m")),
     (rf"{_ANY}(?:gripper|finger)s?[_./](?:width|opening)", ColumnMeaning("finger_width", "m")),
-    (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w{0, 40}", ColumnMeaning("tactile")),
+    (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w{{0,40}}", ColumnMeaning("tactile")),
     (rf"{_ANY}(?:dones?|terminals?|terminated|truncated|success|timeouts?)", ColumnMeaning("label", "1")),
     (rf"{_ANY}(?:rewards?)", ColumnMeaning("score", "1")),
 )
