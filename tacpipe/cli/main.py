@@ -21,7 +21,7 @@ from tacpipe.cli import help as plain_help
 from tacpipe.errors import DONE, FAILED, INTERRUPTED, TacpipeError
 from tacpipe.io import memory, terminal, termination
 from tacpipe.io.files import describe
-from tacpipe.plugins import extras
+from tacpipe.plugins import extras, failures
 
 COMPLETION_VARIABLE = "_TACPIPE_COMPLETE"  # set by the shell: complete_bash, complete_zsh, complete_fish or source_...
 
@@ -151,8 +151,9 @@ def answer(arguments: Sequence[str]) -> int:
         code, sentence = FAILED, str(memory.shortage(error) or describe(error))
         _complain(sentence)
     except Exception as error:
-        explanation = str(memory.shortage(error) or "") or extras.failure_text(error)
+        explanation = str(memory.shortage(error) or "") or failures.failure_text(error)
         if explanation is None and not termination.requested():
+            error.add_note(f"{failures.DEFECT}.")
             raise
         code, sentence = FAILED, str(explanation)
         _complain(sentence)

@@ -18,8 +18,8 @@ from tacpipe.cli.help import unrequested
 from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import terminal
+from tacpipe.plugins import failures, given_params, registry
 from tacpipe.plugins import fields as fields_of
-from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training import devices
@@ -89,7 +89,9 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         if flag != "fold" and options.get(flag) is not None:  # Not all stages have all of these options.
             fields_of.check(options[flag], kind, f"--{flag}")
     if options.get("guess") and stage.guess is not None:
-        terminal.result(stage.guess(options["source"]).rstrip("\n"))
+        with failures.naming_source([options["source"]]):
+            layout = stage.guess(options["source"])
+        terminal.result(layout.rstrip("\n"))
         return
     params = given_params.build(
         name,
@@ -104,7 +106,9 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
         terminal.result(json.dumps(params_of.to_input(params), indent=1))
         return
     if options.get("dry_run") and stage.preview is not None:
-        terminal.result(stage.preview(params, options["source"]))
+        with failures.naming_source([options["source"]]):
+            description = stage.preview(params, options["source"])
+        terminal.result(description)
         return
     if options["output"] is None:
         raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")

@@ -7,7 +7,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError, is_
 from tacpipe.io import files, memory, regular
 from tacpipe.io.files import Draft, Hashed, move, present
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
-from tacpipe.plugins import extras, registry
+from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.rows import RowCounts, RowTally, StageRows, tally_rows
 from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
@@ -103,13 +103,34 @@ def execute(
                 memory.raising_shortage(),
                 extras.explain_missing(f"Stage {stage_name}", lambda: registry.package(stage_name)),
             ):
-                returned = _result(task.name, stage, stage(params, **arguments))
+                with failures.naming_source((task.files or {}).values()) if stage.source else contextlib.nullcontext():
+                    returned = _result(task.name, stage, stage(params, **arguments))
+                if stage.source:
+                    returned = _name_source_of_batches(returned, task.files or {})
                 result = _store_returned(returned, sink, durable=stage.source)  # batches are read here
         except Exception as error:
-            extras.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
+            failures.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
     notes = [*returned.notes, *(note for output in returned.recordings.values() for note in output.notes)]
     return result, notes, _counted_rows(stage, returned, result, tally)
+
+
+def _name_source_of_batches(returned: Result, paths: Mapping[str, str]) -> Result:
+    """Return a reader's result whose batches name the files ``paths`` in errors, also while they are stored."""
+    import pyarrow as pa
+
+    def name_files(rows: pa.Table | pa.RecordBatchReader) -> pa.Table | pa.RecordBatchReader:
+        def read_batches() -> Iterator[pa.RecordBatch]:
+            with failures.naming_source(paths.values()):
+                yield from rows
+
+        return rows if hasattr(rows, "num_rows") else pa.RecordBatchReader.from_batches(rows.schema, read_batches())
+
+    recordings = {
+        name: replace(output, tables={stream: name_files(rows) for stream, rows in output.streams.items()})
+        for name, output in returned.recordings.items()
+    }
+    return replace(returned, recordings=recordings)
 
 
 def _counted_rows(stage: AnyStage, returned: Result, result: StoredResult, tally: RowTally) -> StageRows | None:

@@ -15,8 +15,8 @@ from tacpipe.engine import execution
 from tacpipe.errors import UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import digest, remembered_file_digest
+from tacpipe.plugins import failures, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.records import RecordingEntry, RunIdentity
@@ -271,9 +271,10 @@ def _discover_sources(stage: AnyStage, request: Request) -> dict[str, Source]:
         raise UsageError(f"{request.name} needs a folder of recordings to read.")
     if not request.source.exists():
         raise UsageError(f"There is no {request.source} to read recordings from.")
+    with failures.naming_source([request.source]):
+        discovered = stage.discover(request.params, request.source)
     sources = {
-        name: source if isinstance(source, Source) else Source(source)
-        for name, source in sorted(stage.discover(request.params, request.source).items())
+        name: source if isinstance(source, Source) else Source(source) for name, source in sorted(discovered.items())
     }
     paths.refuse_shared_names(
         (name, next(iter(source.files.values()), request.source)) for name, source in sources.items()

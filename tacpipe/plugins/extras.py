@@ -1,12 +1,10 @@
-"""Explain failures of optional code: the extra that provides a missing module, and the traceback of a stage's exception."""
+"""Explain a missing module of optional code: the extra that provides it, and the command that installs it."""
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NotRequired, TypedDict
@@ -128,14 +126,6 @@ class DirectUrl(TypedDict):
     dir_info: NotRequired[InstalledFolder]
 
 
-class StageFailure(TypedDict):
-    """The stage that raised an exception."""
-
-    stage: str
-    recording: str
-    frames: str  # frames of the traceback
-
-
 def _pip_arguments(source: DirectUrl, extra: str) -> list[str]:
     """Return the arguments of ``pip install`` for an extra of a package with this direct URL."""
     url = str(source["url"])
@@ -228,38 +218,3 @@ def _is_installed(module: str) -> bool:
         return module in sys.modules or find_spec(module) is not None
     except (ImportError, ValueError):
         return False
-
-
-ALL_FRAMES = "TACPIPE_TRACEBACK"  # environment variable: if set, the full traceback is printed
-_NAME = "tacpipe_failure"  # attribute of the exception, which is pickled with it in a worker process
-
-
-def attach_stage(error: BaseException, stage: str, recording: str, outer: tuple[str, ...]) -> None:
-    """Add its stage and recording to ``error``, and its traceback without the leading frames from the files ``outer``."""
-    described = traceback.TracebackException.from_exception(error)
-    frames = list(described.stack)
-    while frames and frames[0].filename in outer:
-        frames.pop(0)
-    described.stack = traceback.StackSummary.from_list(frames)
-    setattr(error, _NAME, {"stage": stage, "recording": recording, "frames": "".join(described.format())})
-
-
-def failure_text(error: BaseException) -> str | None:
-    """Return the message for an exception that a stage raised; None for other exceptions and if all frames are requested."""
-    failure: StageFailure | None = getattr(error, _NAME, None)
-    if failure is None or os.environ.get(ALL_FRAMES):
-        return None
-    on_recording = f" on recording {failure['recording']}" if failure["recording"] else ""
-    return (
-        f"The code of stage {failure['stage']} raised {type(error).__name__}{on_recording}:\n{failure['frames'].rstrip()}\n"
-        f"What was finished is kept in the store. Set {ALL_FRAMES}=1 to see the frames of tacpipe too."
-    )
-
-
-def failure_line(error: BaseException) -> str:
-    """Return a line with the exception and its location: file and line of the innermost frame, or of the syntax error."""
-    described = f"{type(error).__name__}: {error}"
-    if isinstance(error, SyntaxError):  # its text already ends with file name and line
-        return f"{type(error).__name__}: {error.msg}, in {error.filename}, line {error.lineno}."
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{described}, in {frames[-1].filename}, line {frames[-1].lineno}." if frames else f"{described}."

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
 from tacpipe.io.hashing import digest, file_digest
-from tacpipe.plugins import extras
+from tacpipe.plugins import extras, failures
 from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
@@ -439,7 +439,7 @@ def _import(name: str, target: str) -> Any:
     except TacpipeError:
         raise
     except Exception as error:  # the plug-in's module raises an error
-        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {extras.failure_line(error)}") from error
+        raise TacpipeError(f"The module {module} of {name} cannot be loaded. {failures.failure_line(error)}") from error
     try:
         return operator.attrgetter(attribute)(loaded) if attribute else loaded
     except AttributeError as error:

@@ -440,7 +440,13 @@ def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
     """
     with extras.explain_missing(NEEDED_BY):
         import av
+    if not demuxer and path.suffix.lower() not in DEMUXERS:
+        raise TacpipeError(
+            f"{path} cannot be read as a video: its name must end in {', '.join(DEMUXERS)}. Convert it, or leave it out."
+        )
     with regular.failing(path), regular.opened(path) as file:
+        if not path.stat().st_size:
+            raise TacpipeError(f"{path} is empty. Copy it again from its source, or leave it out.")
         try:
             with av.open(file, format=demuxer or DEMUXERS[path.suffix.lower()]) as container:
                 yield container

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import contextlib
 import heapq
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -86,6 +87,7 @@ class VideoFormat:
         """Return the format in the metadata of a packet column. Raises `TacpipeError` if there is none."""
         texts = {key.decode(errors="replace"): value.decode(errors="replace") for key, value in metadata.items()}
         try:
+            _expect_video(texts[_CODEC], texts[_PIXELS])
             return cls(
                 texts[_CODEC],
                 int(texts[_WIDTH]),
@@ -145,6 +147,19 @@ def describe_damage(damaged: Bools) -> str:
         for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)
     ]
     return f"{damaged.sum():,} of {len(damaged):,} frames are damaged ({listed(frames)})"
+
+
+def _expect_video(codec: str, pixel_format: str) -> None:
+    """Raise `ValueError` if FFmpeg knows the codec as one of other data than video, or does not know the pixel format."""
+    try:
+        import av
+    except ImportError:  # decoding reports it
+        return
+    with contextlib.suppress(av.codec.codec.UnknownCodecError):  # decoding reports that there is no decoder
+        if (kind := av.Codec(codec, "r").type) != "video":
+            raise ValueError(f"{plain(codec)} is a codec of {kind}")
+    if pixel_format:
+        av.VideoFormat(pixel_format)
 
 
 def read_format(source: pa.Table | pa.Schema | Columns) -> VideoFormat | None:

@@ -21,6 +21,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import openpyxl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -28,7 +29,10 @@ import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
-from tacpipe.plugins import registry
+from tacpipe.engine import computing
+from tacpipe.errors import ShortageError
+from tacpipe.formats.table import recordings
+from tacpipe.plugins import failures, registry
 from tests import peaks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, video_files, xdf_writer, xela_files
@@ -597,14 +601,29 @@ def _mcap_compressed(folder: Path) -> None:
     (folder / "a.mcap").write_bytes(content.replace(struct.pack("<I", 3) + b"lz4", struct.pack("<I", 3) + b"pkl"))
 
 
-TEXT = "its format has no codecs"
+def _pickled(write: Callable[[Path], object], name: str) -> Callable[[Path], None]:
+    """Return a function that writes a source and puts a pickle that runs code into the place of a file."""
+
+    def pickled(folder: Path) -> None:
+        write(folder)
+        path = next(path for path in sorted(folder.rglob(name)) if path.is_file())
+        path.write_bytes(pickle.dumps(Runs()))
+
+    return pickled
+
+
 RUNS_CODE: dict[str, list[Case] | str] = {
-    "lerobot": "the codecs of Parquet are those of pyarrow, none of which runs code",
+    "lerobot": [
+        Case(
+            _pickled(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"),
+            "episode_000001.parquet is not a whole Parquet file",
+        )
+    ],
     "mcap": [Case(_mcap_compressed, "compressed with pkl, not zstd or lz4")],
     "rosbag": [
         Case(_changed_text("a.bag", b"compression=lz4", b"compression=pkl"), "compressed with pkl, not bz2 or lz4")
     ],
-    "xdf": TEXT,
+    "xdf": [Case(_pickled(_session, "a.xdf"), "a.xdf")],
     "hdf5": [Case(_filter, "filter 31999, which is not read")],
     "zarr": [
         Case(
@@ -624,17 +643,21 @@ RUNS_CODE: dict[str, list[Case] | str] = {
         ),
     ],
     "table": [Case(_archive(t=T, a=np.array([Runs()] * 3)), "holds Python objects", LAYOUT % "npz")],
-    "biotac-slide": TEXT,
+    "biotac-slide": [Case(_pickled(slide_files.write_biotac, "*_bio.csv"), "_bio.csv")],
     "roboskin": [
         Case(
             lambda place: np.save(slide_files.write_roboskin(place, slide_files.touched(1, 20)), np.array([Runs()])),
             "icub_fold_0.npy",
         )
     ],
-    "gelsight-slip": "the codecs of video are those of FFmpeg, none of which runs code",
-    "vision2tactile": TEXT,
-    "xela-flat": TEXT,
-    "xela-psc": TEXT,
+    "gelsight-slip": [Case(_pickled(video_files.write_gelsight, "camera_2.avi"), "camera_2.avi")],
+    "vision2tactile": [Case(_pickled(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
+    "xela-flat": [
+        Case(_pickled(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+    ],
+    "xela-psc": [
+        Case(_pickled(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+    ],
 }
 
 
@@ -791,6 +814,24 @@ def _zipped_session(folder: Path) -> None:
     (folder / "a.xdfz").write_bytes(zipped.compress(session.bytes) + zipped.flush())
 
 
+def _overlong_number(write: Callable[[Path], object], name: str) -> Callable[[Path], None]:
+    """Return a function that writes a source in which a number stands for one of 10^12 digits."""
+
+    def overlong(folder: Path) -> None:
+        write(folder)
+        path = next(path for path in sorted(folder.rglob(name)) if path.is_file())
+        before, _, last = path.read_text().rstrip("\n").rpartition("\n")
+        path.write_text(f"{before}\n{last.rpartition(',')[0]},1e1000000000000\n")
+
+    return overlong
+
+
+def _many_points(folder: Path) -> None:
+    grasp_files.write_grasp(folder)
+    path = next(path for path in sorted(folder.rglob("*.pcd")) if path.is_file())
+    path.write_bytes(re.sub(rb"POINTS \d+", b"POINTS 1000000000000", path.read_bytes()))
+
+
 AT_ONCE = "declares .* GB that would be read at once"
 DECLARED: dict[str, list[Case] | str] = {
     "lerobot": [Case(_wide_template, "data_path|not there"), Case(_long_texts_of_episodes, AT_ONCE)],
@@ -814,14 +855,14 @@ DECLARED: dict[str, list[Case] | str] = {
     ],
     "table": [
         Case(_wide_array, "has 3,000,000,000 values a row", LAYOUT % "npz"),
-        Case(_long_name, "in too many ways", (LAYOUT % "csv").replace('"a*"', '"{a}_{b}_{c}_{d}"')),
+        Case(_long_name, "the name of column 2 has 60,001 characters", LAYOUT % "csv"),
         Case(
             lambda folder: _long_texts(folder / "x.parquet", {"t": np.arange(4000.0), "a": np.ones(4000)}, 4000),
             AT_ONCE,
             (LAYOUT % "parquet").replace("[{", '[{ match = "text", type = "text" }, {'),
         ),
     ],
-    "biotac-slide": "numbers in text declare no size",
+    "biotac-slide": [Case(_overlong_number(slide_files.write_biotac, "*_bio.csv"), "_bio.csv")],
     "roboskin": [
         Case(
             lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)).write_bytes(
@@ -833,9 +874,19 @@ DECLARED: dict[str, list[Case] | str] = {
         )
     ],
     "gelsight-slip": "packets are no larger than their file, and frames have a largest size",
-    "vision2tactile": "its clouds are asked in test_hostile_files.py",
-    "xela-flat": "numbers in text declare no size",
-    "xela-psc": "numbers in text declare no size",
+    "vision2tactile": [Case(_many_points, ".pcd")],
+    "xela-flat": [
+        Case(
+            _overlong_number(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"),
+            "xela_sensor1.csv",
+        )
+    ],
+    "xela-psc": [
+        Case(
+            _overlong_number(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"),
+            "xela_sensor1.csv",
+        )
+    ],
 }
 
 
@@ -854,12 +905,139 @@ def test_a_declared_size_takes_no_memory(lab: Lab, reader: str, case: Case) -> N
 QUESTIONS = {
     "two parts with one name": NAMED_TWICE,
     "a damaged block": DAMAGED,
+    "a declared size": DECLARED,
     "a path that leads out": LEADS_OUT,
     "a codec that runs code": RUNS_CODE,
-    "a declared size": DECLARED,
 }
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks" / "faults.md"
+
+
+def readers_table() -> str:
+    """Return the number of cases of each registered reader and question as a Markdown table."""
+    counts = {
+        reader: [0 if isinstance(cases[reader], str) else len(cases[reader]) for cases in QUESTIONS.values()]
+        for reader in sorted(registry.entry_points()["tacpipe.formats"])
+        if registry.provider_of("tacpipe.formats", reader) is None
+    }
+    rows = {**{f"`{reader}`": numbers for reader, numbers in counts.items()}}
+    rows["in all"] = [sum(numbers) for numbers in zip(*counts.values(), strict=True)]
+    lines = [f"| {name} | {' | '.join(str(number or '–') for number in numbers)} |" for name, numbers in rows.items()]
+    return "\n".join([f"| reader | {' | '.join(QUESTIONS)} |", f"| ---{' | ---:' * len(QUESTIONS)} |", *lines])
+
+
+def test_the_page_of_faults_has_a_row_for_every_reader() -> None:
+    assert readers_table() in PAGE.read_text()
 
 
 @pytest.mark.parametrize("question", list(QUESTIONS))
 def test_every_reader_is_asked(question: str) -> None:
     assert set(QUESTIONS[question]) == set(registry.entry_points()["tacpipe.formats"])
+
+
+# ---- An exception that nothing anticipated
+
+
+def _cut_workbook(folder: Path) -> None:
+    _workbook(folder, lambda sheet: sheet[: len(sheet) // 2])
+
+
+def _entity_bomb(folder: Path) -> None:
+    entities = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10 if n else "a" * 40}">' for n in range(9))
+    bomb = f'<?xml version="1.0"?><!DOCTYPE a [{entities}]><worksheet><v>&e8;</v></worksheet>'
+    _workbook(folder, lambda _: bomb.encode())
+
+
+def _workbook(folder: Path, change: Callable[[bytes], bytes]) -> None:
+    """Write a sound workbook, and one whose sheet is changed."""
+    book = openpyxl.Workbook()
+    for row in (["t", "a"], [0, 1], [1, 2]):
+        book.worksheets[0].append(row)
+    book.save(folder / "sound.xlsx")
+    with zipfile.ZipFile(folder / "sound.xlsx") as sound, zipfile.ZipFile(folder / "bad.xlsx", "w") as bad:
+        for name in sound.namelist():
+            content = sound.read(name)
+            bad.writestr(name, change(content) if name.endswith("sheet1.xml") else content)
+
+
+def _wrong_shape(shape: list[int]) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        lerobot_files.write_v2(folder / "sound")
+        lerobot_files.write_v2(folder / "bad")
+        path = folder / "bad" / "meta" / "info.json"
+        about = json.loads(path.read_text())
+        about["features"]["action"]["shape"] = shape
+        path.write_text(json.dumps(about))
+
+    return write
+
+
+def _video_of_text(folder: Path) -> None:
+    lerobot_files.write_v2(folder / "sound", episodes=1)
+    lerobot_files.write_v2(folder / "bad", episodes=1)
+    path = folder / "bad" / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"video_path": "{video_key}.txt"}))
+    (folder / "bad" / "observation.images.top.txt").write_text("no video")
+
+
+@pytest.mark.parametrize(
+    ("reader", "case"),
+    [
+        ("table", Case(_cut_workbook, r"left out bad: bad\.xlsx cannot be read: ParseError", LAYOUT % "xlsx")),
+        ("table", Case(_entity_bomb, r"left out bad: bad\.xlsx cannot be read: ParseError", LAYOUT % "xlsx")),
+        ("lerobot", Case(_wrong_shape([2**62, 2**62]), "left out bad: bad/meta/info.json: the feature action")),
+        ("lerobot", Case(_wrong_shape([-1]), "left out bad: bad/meta/info.json: the feature action")),
+        ("lerobot", Case(_video_of_text, r"left out bad-episode_000000: .*top\.txt cannot be read as a video")),
+    ],
+)
+def test_a_file_with_an_unusual_fault_costs_its_own_recording(lab: Lab, reader: str, case: Case) -> None:
+    ask(lab, reader, replace(case, option="--skip-bad"), "an unusual fault")
+
+
+@pytest.mark.parametrize("place", ["discover", "call", "batches"])
+def test_any_exception_of_a_reader_names_its_files(lab: Lab, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    def fail(*_: object, **__: object) -> Any:
+        raise ZeroDivisionError("one line\nand more")
+
+    target = {"discover": "find_recordings", "call": "read_streams", "batches": "_note_rate"}[place]
+    monkeypatch.setattr(recordings, target, fail)
+    (lab.folder / "lab").mkdir()
+    (lab.folder / "lab/x.csv").write_text("t,a\n0,1\n1,2\n")
+    (lab.folder / "layout.toml").write_text(LAYOUT % "csv")
+    command = "ingest table lab --layout layout.toml -o out --skip-bad"
+    ran = lab.call(command)
+    source = "lab" if place == "discover" else r"x\.csv"
+    assert ran.code == 1
+    assert re.search(rf"{source} cannot be read: ZeroDivisionError: one line\. Copy it again", ran.err), ran.err
+    assert "Traceback" not in ran.err
+    monkeypatch.setenv("TACPIPE_TRACEBACK", "1")
+    with pytest.raises(ZeroDivisionError):
+        lab.call(command)
+
+
+def test_an_exception_in_code_of_tacpipe_is_called_a_defect(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recordings, "read_streams", None)
+    (lab.folder / "lab").mkdir()
+    (lab.folder / "lab/x.csv").write_text("t,a\n0,1\n1,2\n")
+    (lab.folder / "layout.toml").write_text(LAYOUT % "csv")
+    ran = lab.call("ingest table lab --layout layout.toml -o out")
+    assert ran.code == 1 and "x.csv cannot be read: TypeError" in ran.err
+    assert "This is a defect of tacpipe: report it with the traceback that TACPIPE_TRACEBACK=1 shows" in ran.err
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ShortageError("no memory"), OSError(5, "Input/output error")])
+def test_what_is_no_fault_of_a_file_passes_the_boundary(error: BaseException) -> None:
+    with pytest.raises(type(error)) as raised, failures.naming_source(["a.csv"]):
+        raise error
+    assert raised.value is error
+
+
+def test_a_failure_outside_of_readers_stays_loud(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computing, "_stored_columns", None)
+    (lab.folder / "lab").mkdir()
+    (lab.folder / "lab/x.csv").write_text("t,a\n0,1\n1,2\n")
+    (lab.folder / "layout.toml").write_text(LAYOUT % "csv")
+    with pytest.raises(TypeError) as raised:
+        lab.call("ingest table lab --layout layout.toml -o out --skip-bad")
+    assert raised.value.__notes__ == ["This is a defect of tacpipe: report it with the traceback."]

@@ -31,6 +31,7 @@ DATA_PATHS = {  # default path patterns of the frames by version
 LOCATION_PREFIXES = ("stats/", "data/", "videos/", "meta/", "dataset_")
 NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with an episode's original name and attributes
 ABOUT = "meta/tacpipe.json"  # name, unit and quantity of each value of a feature, in exported datasets
+MAX_VALUES = (1 << 31) - 1  # maximum number of values of a list in Arrow
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces are literal
 
 
@@ -256,6 +257,10 @@ def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescr
     if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
         raise TacpipeError(f"{path}: the feature {plain(key)} is {excerpt(value)}; it must have dtype and shape.")
     feature = FeatureDescription(key, str(value.get("dtype")), tuple(shape))
+    if min(shape, default=0) < 0 or feature.width > MAX_VALUES:
+        raise TacpipeError(
+            f"{path}: the feature {plain(key)} has the shape {excerpt(shape)}; a frame has at most {MAX_VALUES:,} values."
+        )
     exported = about if isinstance(about, dict) else {}
 
     def texts_per_value(texts: Any) -> tuple[str, ...]:

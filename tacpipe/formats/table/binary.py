@@ -28,6 +28,7 @@ from tacpipe.formats.table import text
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
+from tacpipe.plugins import failures
 from tacpipe.printable import listed, plain
 from tacpipe.video.images import PICTURE, array_format, raw_images
 from tacpipe.video.stream import VideoFormat
@@ -62,15 +63,13 @@ class ParquetFile:
 
         Raises `TacpipeError` if it is damaged.
         """
-        try:
-            require_claims(self.path, list(types), rows=min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types))))
+        rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
+        with failures.naming_source([self.path]):
+            require_claims(self.path, list(types), rows=rows)
             with regular.opened(self.path) as file:
                 opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False, page_checksum_verification=True)
-                rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
                 for batch in opened.iter_batches(rows, columns=list(types)):
                     yield _refuse_nested(self.path, pa.Table.from_batches([batch]))
-        except BROKEN as error:
-            raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
 
     def place(self, index: int) -> str:
         """Return the name of the data row ``index`` (from 0) in errors."""
@@ -280,7 +279,19 @@ class ArrayMember:
     @property
     def is_pictures(self) -> bool:
         """Whether the array is images with more values than a table has columns."""
-        return self.video_format is not None and (self.width or 0) > STREAM_COLUMNS
+        return self.video_format is not None and self.is_wide
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether a row has more values than a table has columns."""
+        return (self.width or 0) > STREAM_COLUMNS
+
+    def describe_wide(self) -> str:
+        """Return a phrase about an array whose rows have too many values for columns."""
+        shape = " x ".join(map(str, self.row_shape))
+        return (
+            f"{plain(self.name)} of {shape} values ({self.dtype}) per row, which are no channels; images must be uint8"
+        )
 
     @contextlib.contextmanager
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:

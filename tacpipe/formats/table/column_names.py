@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.errors import TacpipeError
 from tacpipe.formats.table.layout import UNKNOWN
+from tacpipe.printable import excerpt
 
 if TYPE_CHECKING:
     from tacpipe.formats.arrays.tree import StoredAttributes
@@ -21,23 +24,25 @@ if TYPE_CHECKING:
 _TIME_WORDS = r"(t|time|times|time_?stamps?|stamps?|clock|unix_?time|epoch|datetime|date[_ ]?time|date|uhrzeit|zeit)"
 TIME_NAME = re.compile(rf"{_TIME_WORDS}([_ ]?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
 TIME_ENDING = re.compile(rf"\w+_{_TIME_WORDS}(_(s|sec|ms|us|ns))?", re.IGNORECASE)
-UNIT_IN_NAME = re.compile(r"(?P<base>.*?)[ _]*[\[(](?P<unit>[^\])]*)[\])]\s*")
-_MEANINGS = (  # name endings and their quantities; the first match counts
-    (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w*", "tactile"),
+MAX_NAME_CHARACTERS = 1_000  # of a column; text that is longer is no name
+# name endings and their quantities; the first match counts. Limits of repetition keep the time of a search proportional
+# to the length of a name.
+_MEANINGS = (
+    (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w{0,40}", "tactile"),
     (r"(quat|quaternion|orientation|ori|rot|q)_?[xyzw]", "orientation"),
     (
-        r"(velocity|vel|speed)\w*_(joint|j)_?\d+|(joint|j|q)_?\d+_?(velocity|vel|speed)\w*|(dq|qd)_?\d+",
+        r"(velocity|vel|speed)\w{0,40}_(joint|j)_?\d{1,9}|(joint|j|q)_?\d{1,9}_?(velocity|vel|speed)\w{0,40}|(dq|qd)_?\d{1,9}",
         "joint_velocity",
     ),
-    (r"(joint_?(velocity|velocities|vel|speeds?)|qvel)_?\d+", "joint_velocity"),
-    (r"(joint_?(positions?|pos|angles?|states?)|joints|qpos)_?\d+", "joint_position"),
-    (r"(effort|torque|tau)\w*_?(joint|j)?_?\d+", "joint_torque"),
-    (r"(joint|j|q)_?\d+(_?(pos|position))?(_?(rad|deg))?", "joint_position"),
+    (r"(joint_?(velocity|velocities|vel|speeds?)|qvel)_?\d{1,9}", "joint_velocity"),
+    (r"(joint_?(positions?|pos|angles?|states?)|joints|qpos)_?\d{1,9}", "joint_position"),
+    (r"(effort|torque|tau)\w{0,40}_?(joint|j)?_?\d{1,9}", "joint_torque"),
+    (r"(joint|j|q)_?\d{1,9}(_?(pos|position))?(_?(rad|deg))?", "joint_position"),
     (r"(f|force|kraft)_?[xyz](_?m?n)?", "force"),
     (r"(t|tau|m|torque|moment)_?[xyz](_?nm)?", "torque"),
     (r"(pos|position|translation|p|ee|tcp)_?[xyz](_?m?m)?", "position"),
-    (r"temp\w*", "temperature"),
-    (r"(press|druck)\w*", "static_pressure"),
+    (r"temp\w{0,40}", "temperature"),
+    (r"(press|druck)\w{0,40}", "static_pressure"),
 )
 _UNITS = {"orientation": "1"}  # quantities with only one unit
 _SUFFIXES = (  # endings that indicate a unit, the unit, and its quantities
@@ -74,6 +79,16 @@ def meaning(name: str, kind: str) -> tuple[str, str]:
     return UNKNOWN, UNKNOWN
 
 
+def expect_short(names: Iterable[str], path: Path) -> None:
+    """Raise `TacpipeError` for a column name in ``path`` with more than `MAX_NAME_CHARACTERS`."""
+    for number, name in enumerate(names, 1):
+        if len(name) > MAX_NAME_CHARACTERS:
+            raise TacpipeError(
+                f"{path}: the name of column {number} has {len(name):,} characters, {excerpt(name)}; at most "
+                f"{MAX_NAME_CHARACTERS:,} are read. Correct the header, or the separator."
+            )
+
+
 def is_label(name: str) -> bool:
     """Return whether a name is that of labels rather than readings; it may start with a sensor's name.
 
@@ -103,8 +118,22 @@ def without_unit(name: str) -> str:
     >>> without_unit("Fx [N]"), without_unit("time (ms)"), without_unit("pad[3]")
     ('Fx', 'time', 'pad[3]')
     """
-    match = UNIT_IN_NAME.fullmatch(name.strip())
-    return match["base"] if match and match["base"] and not match["unit"].isdigit() else name.strip()
+    base, unit = split_unit(name)
+    return base if base and not unit.isdigit() else name.strip()
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return a column's name before a unit in brackets, and the unit; both are empty without brackets at the end.
+
+    >>> split_unit("Fx [N]"), split_unit("F (x)_(N)"), split_unit("Fx")
+    (('Fx', 'N'), ('F (x)', 'N'), ('', ''))
+    """
+    text = name.strip()
+    if not text.endswith(("]", ")")):
+        return "", ""
+    start = max(text.rfind("]", 0, -1), text.rfind(")", 0, -1)) + 1
+    openings = [at for bracket in "[(" if (at := text.find(bracket, start)) >= 0]
+    return (text[: min(openings)].rstrip(" _"), text[min(openings) + 1 : -1]) if openings else ("", "")
 
 
 def identifier(base: str) -> str:
@@ -149,17 +178,18 @@ def numbered_pattern(name: str) -> str:
     """
     counter = itertools.count(2)
     labels: set[str] = set()
+    has_several = len(re.findall(r"\d+", name)) > 1
 
     def placeholder(number: re.Match[str]) -> str:
         word = number[1].strip("_ .").lower()
-        is_label = len(word) > 1 or (name.count(word) and len(re.findall(r"\d+", name)) > 1)
+        is_label = len(word) > 1 or (name.count(word) and has_several)
         label = word if is_label and word.isidentifier() else "number"
         while label in labels:
             label = f"{label}{next(counter)}"
         labels.add(label)
         return f"{number[1]}{{{label}}}"
 
-    return re.sub(r"([A-Za-z_]*[ .]?)\d+", placeholder, name)
+    return re.sub(r"([A-Za-z_]{0,64}[ .]?)\d+", placeholder, name)
 
 
 XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
@@ -216,7 +246,7 @@ _ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # name, and the meaning for
     (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", ColumnMeaning("joint_velocity", "rad/s")),
     (rf"{_ANY}(?:joint_torques?|tau)", ColumnMeaning("joint_torque", "N m")),
     (rf"{_ANY}(?:gripper|finger)s?[_./](?:width|opening)", ColumnMeaning("finger_width", "m")),
-    (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w*", ColumnMeaning("tactile")),
+    (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w{{0,40}}", ColumnMeaning("tactile")),
     (rf"{_ANY}(?:dones?|terminals?|terminated|truncated|success|timeouts?)", ColumnMeaning("label", "1")),
     (rf"{_ANY}(?:rewards?)", ColumnMeaning("score", "1")),
 )

@@ -20,6 +20,7 @@ from tacpipe.formats.container import (
 )
 from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
+from tacpipe.plugins import failures
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, P, R, RecordingOutput, Shared, Source, Stage, Values, stage
 from tacpipe.plugins.stream_selection import StreamSelection
@@ -164,12 +165,13 @@ class _ContainerShares:
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
         if kind in layouts.CAMERA:
             return None
-        if path not in self._opened:
-            self._opened[path] = open_container(str(kind), path)
-        container = self._opened[path]
         requested = [stream.source for stream in streams.values()] or None
         try:
-            return container.share(requested, episode) if isinstance(container, Sharing) else None
+            with failures.naming_source([path]):
+                if path not in self._opened:
+                    self._opened[path] = open_container(str(kind), path)
+                container = self._opened[path]
+                return container.share(requested, episode) if isinstance(container, Sharing) else None
         except TacpipeError as error:
             if not is_input_error(error):
                 raise

@@ -7,6 +7,7 @@ import csv
 import datetime
 import itertools
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,8 +19,9 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels import schema
+from tacpipe.errors import TacpipeError
 from tacpipe.formats.table import binary, column_names, label_table, stamps, text
-from tacpipe.formats.table.binary import ArrayMember
+from tacpipe.formats.table.binary import STREAM_COLUMNS, ArrayMember
 from tacpipe.formats.table.columns import MAX_EXACT, TYPES
 from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, StreamLayout, extension, quoted
 from tacpipe.formats.table.text import Workbook
@@ -28,7 +30,7 @@ SAMPLE_LINES = 200  # number of lines sampled per file
 HEAD_BYTES = 1 << 20  # maximum number of bytes sampled per file
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
 _WHOLE = re.compile(r"[-+]?\d{1,20}")
 _COMMA_NUMBER = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 MISSING = ("", "NA", "N/A", "nan", "NaN", "null", "None", "-")
@@ -170,6 +172,7 @@ class FileSample:
     text: Dialect | None = None  # None if it is not a text file
     encoding: str = "utf-8"
     arrays: Mapping[str, ArrayMember] = field(default_factory=dict)  # arrays of a file of arrays; otherwise empty
+    wide_arrays: tuple[str, ...] = ()  # arrays with too many values per row to be channels
     units: Mapping[str, str] = field(default_factory=dict)  # units by column, from a row below the header
     frames: int | None = None  # number of frames of a video or a folder of images
 
@@ -180,8 +183,8 @@ class FileSample:
 
     def stated_unit(self, column: str) -> str:
         """Return a column's unit from the header or the row below it, or "" if neither contains one."""
-        match = column_names.UNIT_IN_NAME.fullmatch(column.strip())
-        text = self.units.get(column, "") or (match["unit"] if match and match["base"] else "")
+        base, unit = column_names.split_unit(column)
+        text = self.units.get(column, "") or (unit if base else "")
         return schema.unit_from_text(text.strip().strip("[]()"))
 
     def only(self, arrays: Sequence[str]) -> FileSample:
@@ -196,7 +199,13 @@ def read_sample(path: Path) -> FileSample:
     kind = EXTENSIONS[extension(path)]
     if kind == "csv":
         encoding = detect_encoding(path)
-        text = detect_dialect(first_lines(path, encoding))
+        try:
+            text = detect_dialect(first_lines(path, encoding))
+        except csv.Error as error:
+            raise TacpipeError(
+                f"{path} is not a table: {error}. Copy it again from its source, or leave it out."
+            ) from error
+        column_names.expect_short(text.names, path)
         columns = list(zip(*text.rows, strict=True)) or [()] * len(text.names)
         values = {
             name: tuple(_parse_cell(cell, text) for cell in cells)
@@ -209,16 +218,21 @@ def read_sample(path: Path) -> FileSample:
     if isinstance(file, binary.NumpyArchive):
         file = replace(file, time_axis=_time_axis(file.arrays()))
         arrays = file.arrays()
-        pictures = tuple(name for name, array in arrays.items() if array.is_pictures)
-        return replace(_first_rows(file, pictures), arrays=arrays)
+        pictures = [name for name, array in arrays.items() if array.is_pictures]
+        wide = [name for name, array in arrays.items() if not array.is_pictures and array.is_wide]
+        if wide and len(wide) == len(arrays):
+            raise TacpipeError(f"{path} holds {arrays[wide[0]].describe_wide()}.")
+        tables = {name: array for name, array in arrays.items() if name not in wide}
+        return replace(_first_rows(file, [*pictures, *wide]), arrays=tables, wide_arrays=tuple(wide))
     return _first_rows(file)
 
 
 def _first_rows(
-    file: binary.ParquetFile | binary.NumpyArchive | binary.JsonLines | Workbook, pictures: Sequence[str] = ()
+    file: binary.ParquetFile | binary.NumpyArchive | binary.JsonLines | Workbook, left_out: Sequence[str] = ()
 ) -> FileSample:
-    """Return the columns and first rows of a file that is not text, without the arrays ``pictures``."""
-    names = [name for name in file.names() if not any(belongs_to(name, array) for array in pictures)]
+    """Return the columns and first rows of a file that is not text, without the arrays ``left_out``."""
+    names = [name for name in file.names() if not any(belongs_to(name, array) for array in left_out)]
+    column_names.expect_short(names, file.path)
     if isinstance(file, binary.JsonLines):
         columns = {name: file.head().column(name) for name in file.head().column_names}
     elif isinstance(file, binary.NumpyArchive):  # the arrays of an archive may differ in length
@@ -234,13 +248,15 @@ def _first_rows(
 def _time_axis(arrays: Mapping[str, ArrayMember]) -> int:
     """Return the axis of the rows of arrays.
 
-    It is the first axis, unless the only array has another one so much longer that the first must belong to the sensor.
+    It is the first axis, unless the only array has another one so much longer that the first must belong to the sensor,
+    and rows along it have no more values than a table has columns.
     """
     shape = next(iter(arrays.values())).shape if len(arrays) == 1 else ()
     if len(shape) < 2:
         return 0
     longest = shape.index(max(shape))
-    return longest if shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
+    is_table = max(shape) > 0 and math.prod(shape) // max(shape) <= STREAM_COLUMNS
+    return longest if is_table and shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
 
 
 def belongs_to(column: str, array: str) -> bool:

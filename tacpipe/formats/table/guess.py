@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
-from tacpipe.formats import container
+from tacpipe.formats import container, image_files
 from tacpipe.formats.table import column_names, file_sample, pattern, reading, repairs, rows
 from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
@@ -32,6 +32,7 @@ from tacpipe.formats.table.layout import (
 )
 from tacpipe.io import config_text
 from tacpipe.io import files as file_system
+from tacpipe.plugins import failures
 from tacpipe.printable import shown
 from tacpipe.video.files import DEMUXERS, IMAGE_CODECS, scan, scan_images
 
@@ -105,7 +106,8 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
     used: set[str] = set()
     for paths in itertools.chain.from_iterable(map(_group_by_file_name, by_template.values())):
         try:
-            sample = file_sample.read_sample(folder / paths[0])
+            with failures.naming_source([folder / paths[0]]):
+                sample = file_sample.read_sample(folder / paths[0])
         except MissingModuleError:
             raise
         except TacpipeError as error:
@@ -116,7 +118,9 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
             continue
         sample = _with_columns_of(sample, [folder / path for path in paths[1:]])
         is_shared_table = len(paths) == 1 < len(data) and _is_labels(sample)
-        group = _FileGroup(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
+        group = _FileGroup(
+            _stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample, skipped=sample.wide_arrays
+        )
         has_one_row_per_file = (
             sample.text is not None and sample.text.header and len(sample.text.rows) == 1 and len(paths) > 1
         )
@@ -131,7 +135,8 @@ def _with_columns_of(sample: FileSample, paths: Sequence[Path]) -> FileSample:
     """Return the sample of a text file with the columns that only other files of the stream have."""
     for path in paths if sample.text is not None and sample.text.header else ():
         try:
-            other = file_sample.read_sample(path)
+            with failures.naming_source([path]):
+                other = file_sample.read_sample(path)
         except TacpipeError:
             continue
         names = [name for name in other.names if name not in sample.values] if other.text and other.text.header else []
@@ -152,7 +157,8 @@ def _camera_groups(
     for (_, are_folders), paths in by_template.items():
         for same_stream in _group_by_file_name(paths):
             try:
-                entries, count = (_image_entries if are_folders else _video_entries)(folder / same_stream[0])
+                with failures.naming_source([folder / same_stream[0]]):
+                    entries, count = (_image_entries if are_folders else _video_entries)(folder / same_stream[0])
             except MissingModuleError:
                 raise
             except TacpipeError as error:
@@ -177,8 +183,8 @@ def _video_entries(path: Path) -> tuple[tuple[str, ...], int]:
 
 def _image_entries(folder: Path) -> tuple[tuple[str, ...], int]:
     """Return the layout entries and the number of images of a folder. Large numbers in file names are timestamps."""
-    paths = reading.image_paths(folder)
-    numbers = [reading.last_number(path) for path in paths]
+    paths = image_files.image_paths(folder)
+    numbers = [image_files.last_number(path) for path in paths]
     values = tuple(float(number) if "." in number else int(number) for number in numbers if number is not None)
     is_stamp = len(values) == len(paths) and min(values) >= 1e8
     time = f'{{ rate_hz = "{UNKNOWN}" }}  # the names hold no stamps'
@@ -198,7 +204,7 @@ def _group_by_length(group: _FileGroup) -> list[_FileGroup]:
         clock = file_sample.time_column(group.first.only(others)) if others else None
         streams = [_picture_group(group, name, clock) for name in pictures]
         if set(others) - {clock}:
-            without_pictures = replace(group, first=group.first.only(others), skipped=tuple(pictures))
+            without_pictures = replace(group, first=group.first.only(others), skipped=(*group.skipped, *pictures))
             streams += _group_by_length(without_pictures)
         return streams
     by_length: dict[int, list[str]] = {}
@@ -209,7 +215,7 @@ def _group_by_length(group: _FileGroup) -> list[_FileGroup]:
     groups = []
     for names in by_length.values():
         widest = max(names, key=lambda name: group.first.arrays[name].width or 1)
-        skipped = tuple(name for name in group.first.arrays if name not in names)
+        skipped = (*group.skipped, *(name for name in group.first.arrays if name not in names))
         stream = re.sub(r"\W", "_", widest) if widest.isascii() and not widest[0].isdigit() else group.stream
         groups.append(replace(group, stream=stream, first=group.first.only(names), skipped=skipped))
     return groups
@@ -387,9 +393,9 @@ def _with_repairs(text: str, group: _FileGroup, folder: Path) -> str:
         for _ in layouts.REPAIRS:
             repaired = replace(stream, time=replace(stream.time, **{k: v for k, v in changes.items() if v != UNKNOWN}))
             try:
-                first_rows.append(
-                    reading.check_stamps(rows.open_rows(folder / path, repaired), repaired, stamps).drop_first
-                )
+                with failures.naming_source([folder / path]):
+                    clock = reading.check_stamps(rows.open_rows(folder / path, repaired), repaired, stamps)
+                first_rows.append(clock.drop_first)
             except repairs.ClockError as error:
                 if error.changes.items() <= changes.items():
                     break

@@ -151,7 +151,7 @@ def _level_pattern(
     pattern = ""
     for index, (kind, texts) in enumerate(common_parts):
         counter = _COUNTER.search(pattern)
-        word = re.search(r"([A-Za-z]{2,})[-_ #.]*$", pattern)
+        word = re.search(r"(?<![A-Za-z])([A-Za-z]{2,})[-_ #.]*$", pattern)
         if kind not in ("date", "number", "text"):
             pattern += kind
             continue

@@ -29,6 +29,7 @@ from tacpipe.formats.table import labels, pattern, recordings
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout, why_unreadable
 from tacpipe.formats.table.recordings import CONTAINER, RecordingFiles
+from tacpipe.plugins import failures
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 
@@ -174,7 +175,8 @@ def describe_sources(layout: Layout, folder: Path, sources: Sequence[RecordingFi
     lines += _describe_labels(labelled)
     for source in sources:
         try:
-            return "\n".join([*lines, *_describe_recording(layout, source, kind)])
+            with failures.naming_source(source.files.values()):
+                return "\n".join([*lines, *_describe_recording(layout, source, kind)])
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
@@ -252,8 +254,9 @@ def declared_layout(kind: str, source: Path) -> str:
     remarks: list[str] = []
     for path in paths:
         try:
-            file = open_container(kind, path)
-            contents = file.look(next(iter(file.episodes()), None))
+            with failures.naming_source([path]):
+                file = open_container(kind, path)
+                contents = file.look(next(iter(file.episodes()), None))
         except TacpipeError as error:
             if not is_input_error(error):
                 raise

@@ -7,7 +7,6 @@ channels follow one another. So runs of rows are sorted, spilled to disk and mer
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -19,14 +18,15 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, Floats, Indices, Times, from_arrow
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats import image_files
 from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import binary, columns, rows, stamps
+from tacpipe.formats.table.column_names import expect_short
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout
 from tacpipe.formats.table.repairs import StreamClock
 from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
 from tacpipe.formats.table.text import TextTable
-from tacpipe.io import files as file_system
 from tacpipe.io.spill import Piece, Spill, in_order
 from tacpipe.plugins.rows import drop_rows
 from tacpipe.plugins.stage import Shared
@@ -261,6 +261,7 @@ def _batches(
     `TacpipeError` for a missing column, and the errors of `stream_batches`.
     """
     path, names = file.path, file.names()
+    expect_short(names, path)
     clock = "" if stream.time.file else stream.time.column
     reserved_names = [name for name in (clock, stream.recording) if name]
     if stream.long is not None:
@@ -472,7 +473,9 @@ def camera_batches(
     else from the video. Raises `TacpipeError` for unreadable videos and images, for decreasing timestamps, and if the
     numbers of timestamps and frames differ.
     """
-    images = image_paths(path) if stream.camera == "images" else []
+    images = image_files.image_paths(path) if stream.camera == "images" else []
+    for image in images:
+        image_files.expect_complete(image)
     frames = None if images else video_files.scan(path)
     count = len(images) if frames is None else len(frames)
     origin = None
@@ -528,50 +531,17 @@ def image_batches(path: Path, stream: StreamLayout, stamps_path: Path | None = N
     return frames_from_images(frames, f"{path}, {plain(source.source)}")
 
 
-def image_paths(folder: Path) -> list[Path]:
-    """Return the images directly in a folder, sorted by name with numbers by value.
-
-    Raises `TacpipeError` if there is none.
-    """
-    names = next((names for directory, _, names in file_system.walk(folder) if Path(directory) == folder), ())
-    images = [path for path in (folder / name for name in names) if path.suffix.lower() in video_files.IMAGE_CODECS]
-    if not images:
-        raise TacpipeError(f"{folder} holds no image. Give a folder with JPEG, PNG or WebP files.")
-    return sorted(
-        images, key=lambda path: [(int(part), "") if part.isdigit() else (-1, part) for part in parts_of(path)]
-    )
-
-
-def parts_of(path: Path) -> list[str]:
-    """Return a file name split before and after each number.
-
-    >>> parts_of(Path("a/frame_12.jpg"))
-    ['frame_', '12', '.jpg']
-    """
-    return [part for part in re.split(r"([0-9]+)", path.name) if part]
-
-
 def _stamps_of_names(images: Sequence[Path], stream: StreamLayout) -> Times:
     """Return the timestamps in image names, which are the last number of each, in ns (image,).
 
     Raises `TacpipeError` if a name has no number.
     """
-    numbers = [last_number(path) for path in images]
+    numbers = [image_files.last_number(path) for path in images]
     nameless = [path for path, number in zip(images, numbers, strict=True) if number is None]
     if nameless:
         raise TacpipeError(f"{nameless[0]} has no number in its name. Give a rate_hz or a file of stamps as its time.")
     place = lambda row: str(images[row])  # noqa: E731
     return rows.stamps_of_column(pa.chunked_array([pa.array(numbers).cast(stamps.DECIMAL)]), stream, place)
-
-
-def last_number(path: Path) -> str | None:
-    """Return the last number in the name of an image as text, or None if it has none.
-
-    >>> last_number(Path("left_1744849152.25.jpg")), last_number(Path("a.png"))
-    ('1744849152.25', None)
-    """
-    numbers = re.findall(r"[0-9]+(?:[.][0-9]+)?", path.stem)
-    return numbers[-1] if numbers else None
 
 
 def _start_ns(stream: StreamLayout) -> int:

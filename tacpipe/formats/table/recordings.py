@@ -33,6 +33,7 @@ from tacpipe.formats.table.reading import (
     stream_batches,
 )
 from tacpipe.io import files as file_system
+from tacpipe.plugins import failures
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 from tacpipe.video.files import IMAGE_CODECS
@@ -140,8 +141,9 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     read.
     """
     try:
-        container = open_container(kind, path)
-        return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
+        with failures.naming_source([path]):
+            container = open_container(kind, path)
+            return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
             raise
@@ -177,9 +179,10 @@ def _refuse_unmatched(layout: Layout, matched: Mapping[str, Sized], candidates: 
     """Raise `UsageError` if no file matches the pattern of a required stream."""
     for stream in layout.streams:
         if not matched[stream.name] and not stream.optional:
+            images = f"; images are files of {', '.join(IMAGE_CODECS)}" if stream.camera == "images" else ""
             raise UsageError(
                 f"No file below {folder} matches {plain(stream.files, 120)} of [streams.{stream.name}]. There are "
-                f"{len(candidates)} files, as {listed(candidates, 3)}; patterns start from {folder}."
+                f"{len(candidates)} files, as {listed(candidates, 3)}; patterns start from {folder}{images}."
             )
 
 
@@ -227,7 +230,8 @@ def _parts_of_file(path: Path, stream: StreamLayout, stamps_path: Path | None) -
     A file with wrong stamps is one recording, whose reading reports them.
     """
     try:
-        count = check_stamps(rows.open_rows(path, stream), stream, stamps_path).parts
+        with failures.naming_source([path]):
+            count = check_stamps(rows.open_rows(path, stream), stream, stamps_path).parts
     except TacpipeError as error:
         if not is_input_error(error):
             raise
@@ -246,19 +250,20 @@ def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
 
     if stream.contained:
         return {name for name in _episodes(str(stream.format), path)[0] if name is not None} or None
-    file = rows.open_rows(path, stream)
-    if stream.recording not in file.names():
-        raise TacpipeError(
-            f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
-        )
     names_in_file: set[str] = set()
-    for block in file.batches({stream.recording: pa.string()}):
-        names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
-        if None in names or "" in names:
+    with failures.naming_source([path]):
+        file = rows.open_rows(path, stream)
+        if stream.recording not in file.names():
             raise TacpipeError(
-                f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or remove the row."
+                f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
             )
-        names_in_file |= set(names)
+        for block in file.batches({stream.recording: pa.string()}):
+            names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
+            if None in names or "" in names:
+                raise TacpipeError(
+                    f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or remove the row."
+                )
+            names_in_file |= set(names)
     return names_in_file
 
 

@@ -281,6 +281,8 @@ def _shorten(path: Path) -> None:
         ({"chunks_size": 0.5}, ("chunks_size", "0.5")),
         ({"chunks_size": "abc"}, ("chunks_size", "abc")),
         ({"features": {"action": [7]}}, ("action", "shape")),
+        ({"features": {"action": {"dtype": "float32", "shape": [-1]}}}, ("action", "[-1]")),
+        ({"features": {"action": {"dtype": "float32", "shape": [2**62, 2**62]}}}, ("action", "2,147,483,647")),
         ({"data_path": "data/{episode}"}, ("data_path", "episode_index")),
     ],
 )

@@ -1,5 +1,6 @@
 """Video files and folders of images become streams of frames of a lab's own recordings."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 import tacpipe
 from tacpipe.arrays import Bytes
 from tacpipe.datasets.dataset import Recording
+from tacpipe.errors import TacpipeError
 from tacpipe.formats.table import guess
-from tacpipe.video import decoding, stream
+from tacpipe.video import decoding, files, stream
 from tests.conftest import Lab
 from tests.video import videos
 
@@ -182,3 +184,79 @@ def test_an_entry_that_a_camera_does_not_take_is_refused(lab: Lab, layout: str, 
     refused = lab.call("ingest table lab --layout layout.toml -o data/lab")
     assert refused.code == 2
     assert sentence in refused.err
+
+
+@pytest.mark.parametrize(("encoder", "ending"), [("png", "png"), ("mjpeg", "jpg"), ("libwebp", "webp")])
+def test_an_image_that_is_cut_off_is_named_when_it_is_ingested(lab: Lab, encoder: str, ending: str) -> None:
+    for trial in "ab":
+        folder = lab.folder / "images" / trial / "frames"
+        folder.mkdir(parents=True)
+        for number, image in enumerate(videos.images(3, 480, 640)):
+            with av.open(str(folder / f"{number}.{ending}"), "w", format="image2") as container:
+                track: Any = container.add_stream(encoder, rate=25)
+                track.width, track.height = 640, 480
+                track.pix_fmt = {"libwebp": "yuv420p"}.get(encoder) or videos.PIXELS[encoder]
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                container.mux([*track.encode(frame), *track.encode(None)])
+    path = lab.folder / f"images/a/frames/1.{ending}"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    (lab.folder / "layout.toml").write_text(IMAGES % "{ rate_hz = 25 }")
+    ran = lab.run("ingest table images --layout layout.toml -o data/images --skip-bad")
+    assert f"left out a: a/frames/1.{ending} is cut off" in ran.err
+    path.write_bytes(b"")
+    assert f"1.{ending} is empty" in lab.run("ingest table images --layout layout.toml -o data/i --skip-bad").err
+    path.write_bytes(b"GIF89a" + bytes(100))
+    assert (
+        f"1.{ending} is no .{ending} image" in lab.run("ingest table images --layout layout.toml -o i --skip-bad").err
+    )
+
+
+def test_the_kinds_of_images_that_are_read_are_named_where_a_folder_holds_others(lab: Lab) -> None:
+    folder = lab.folder / "images/a/frames"
+    folder.mkdir(parents=True)
+    (folder / "1.bmp").write_bytes(b"BM" + bytes(60))
+    (lab.folder / "layout.toml").write_text(IMAGES % "{ rate_hz = 25 }")
+    refused = lab.call("ingest table images --layout layout.toml -o data/images")
+    assert refused.code == 2 and "a/frames/1.bmp" in refused.err
+    assert "images are files of .jpeg, .jpg, .png, .webp" in refused.err
+
+
+def test_an_empty_video_and_one_of_another_ending_are_left_out_with_skip_bad(lab: Lab) -> None:
+    write_trials(lab.folder / "lab")
+    (lab.folder / "lab/b/gel.mp4").write_bytes(b"")
+    (lab.folder / "layout.toml").write_text(LAYOUT % ("mp4", ""))
+    ran = lab.run("ingest table lab --layout layout.toml -o data/lab --skip-bad")
+    assert "left out b: b/gel.mp4 is empty" in ran.err
+    (lab.folder / "lab/b/gel.mp4").rename(lab.folder / "lab/b/gel.gif")
+    (lab.folder / "lab/a/gel.mp4").rename(lab.folder / "lab/a/gel.gif")
+    (lab.folder / "layout.toml").write_text(LAYOUT % ("gif", 'format = "video"'))
+    refused = lab.call("ingest table lab --layout layout.toml -o data/gif")
+    assert refused.code == 1 and "gel.gif cannot be read as a video: its name must end in .avi" in refused.err
+
+
+def test_a_video_whose_times_do_not_fit_costs_its_own_recording(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_trials(lab.folder / "lab")
+    scan = files.scan
+
+    def scan_with_long_times(path: Path) -> files.VideoScan:
+        frames = scan(path)
+        return replace(frames, pts=frames.pts << 40) if path.parent.name == "b" else frames
+
+    monkeypatch.setattr(files, "scan", scan_with_long_times)
+    (lab.folder / "layout.toml").write_text(LAYOUT % ("mp4", ""))
+    ran = lab.run("ingest table lab --layout layout.toml -o data/lab --skip-bad")
+    assert "left out b: b/gel.mp4, b/skin.csv cannot be read: OverflowError" in ran.err
+    assert "This is a defect of tacpipe" in ran.err
+
+
+@pytest.mark.parametrize("values", [{"codec": "aac"}, {"pixel_format": "nonsense"}])
+def test_metadata_that_are_not_of_video_are_one_sentence(lab: Lab, values: dict[str, str]) -> None:
+    write_trials(lab.folder / "lab")
+    (lab.folder / "layout.toml").write_text(LAYOUT % ("mp4", ""))
+    lab.run("ingest table lab --layout layout.toml -o data/lab")
+    recording = next(iter(tacpipe.open(lab.folder / "data/lab").recordings.values()))
+    metadata = {**(recording.columns("gel").schema.field("packet").metadata or {})}
+    metadata |= {key.encode(): value.encode() for key, value in values.items()}
+    with pytest.raises(TacpipeError, match="does not state its video format") as refused:
+        stream.VideoFormat.from_metadata(metadata)
+    assert next(iter(values.values())) in str(refused.value)

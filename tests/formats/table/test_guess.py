@@ -1,3 +1,4 @@
+import time
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -7,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.formats.table import file_sample, guess, labels, layout, pattern, recordings
+from tacpipe.formats.table import column_names, file_sample, guess, labels, layout, pattern, recordings
 from tests.formats.table import labs
 
 
@@ -192,3 +193,40 @@ def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) 
     ):
         assert [line for line in comments if path in line and reason in line], comments
     assert not any("skin.csv" in line for line in comments)
+
+
+@pytest.mark.parametrize("letter", [*" [(_a)1", "a_", "_pad", "vel_", "a1"])
+def test_a_name_of_any_length_is_read_in_linear_time(tmp_path: Path, letter: str) -> None:
+    (tmp_path / "1.csv").write_text(f"t,a{letter * 60_000}x\n0,1\n1,2\n")
+    with pytest.raises(
+        UsageError, match=r"1\.csv: the name of column 2 has [\d,]+ characters|1\.csv is not a table: field larger"
+    ):
+        guess.guess_layout(tmp_path)
+    started = time.process_time()
+    for ending in ("x", "{", "-"):
+        text = f"a{letter * 60_000}{ending}"
+        column_names.without_unit(text)
+        column_names.meaning(text, "float64")
+        column_names.meanings(text, 3)
+        column_names.component(text)
+    column_names.numbered_pattern(letter * 1000)
+    assert time.process_time() - started < 20
+
+
+def test_the_unit_in_a_name_is_the_last_text_in_brackets() -> None:
+    pairs = {"Fx [N]": ("Fx", "N"), "t (ms)": ("t", "ms"), "a (b) [c": ("", ""), "[N]": ("", "N"), "a [(N)]": ("", "")}
+    assert {name: column_names.split_unit(name) for name in pairs} == pairs
+
+
+@pytest.mark.parametrize("is_archive", [True, False])
+def test_an_image_of_floats_is_no_table_of_columns(tmp_path: Path, is_archive: bool) -> None:
+    images = np.zeros((50, 240, 320, 3), np.float32)
+    if is_archive:
+        np.savez(tmp_path / "1.npz", image=images, t=np.arange(50) / 30, force=np.arange(50.0) % 7)
+        text = guess.guess_layout(tmp_path)
+        assert '{ match = "image*", skip = true }' in text and "time_axis" not in text
+        assert 'match = "force"' in text and len(text) < 3000
+    else:
+        np.save(tmp_path / "1.npy", images)
+        with pytest.raises(UsageError, match="240 x 320 x 3 values"):
+            guess.guess_layout(tmp_path)
