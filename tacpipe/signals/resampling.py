@@ -11,13 +11,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
+from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.kinematics import make_continuous
 
 GAP_NS = 50_000_000  # longest time between two samples without a gap, for sensors of 20 Hz or more
 GAP_PERIODS = 2.5  # the same limit for slower sensors, in periods
 STEPS_AT_ONCE = 1 << 20  # number of steps between samples that are in memory at once
+GRID_ROWS = 1 << 22  # number of rows that any grid may have
+GRID_ROWS_PER_SAMPLE = 100  # maximum of a longer grid
 HALF_BITS = 22  # bits of half a step in ns
 PARALLEL = 1e-6  # rad; below this angle, slerp divides by almost zero, and linear weights are exact to 1e-13
 
@@ -38,14 +40,39 @@ def uniform_grid(first_ns: int, last_ns: int, rate_hz: float) -> Times:
 def uniform_offsets(first: int, count: int, rate_hz: float) -> Times:
     """Return ``round(k * 1e9 / rate_hz)`` for ``count`` integers k from ``first``, int64 (time,).
 
-    Raises `TacpipeError` if the rate is not positive.
+    Raises the errors of `offsets_of_numbers`.
 
     >>> uniform_offsets(1, 2, 30.0).tolist()
     [33333333, 66666667]
     """
+    return offsets_of_numbers(np.arange(first, first + count), rate_hz)
+
+
+def offsets_of_numbers(numbers: Int64s, rate_hz: float) -> Times:
+    """Return ``round(k * 1e9 / rate_hz)`` for each of the ``numbers`` k (time,), int64 (time,).
+
+    Raises `TacpipeError` if the rate is not positive.
+    """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e9):
         raise TacpipeError(f"The rate of a grid is {rate_hz} Hz; it must be above 0 and at most 1e9 Hz.")
-    return np.rint(np.arange(first, first + count, dtype=np.float64) * 1e9 / rate_hz).astype(np.int64)
+    return np.rint(numbers.astype(np.float64) * 1e9 / rate_hz).astype(np.int64)
+
+
+def expect_grid_of_samples(rows: int, sample_count: int, t_ns: Times, place: str) -> None:
+    """Raise `TacpipeError` if a grid of ``rows`` over samples at ``t_ns`` (time,) would mostly repeat them.
+
+    ``sample_count`` is that of the stream with the most samples. The error, which begins with ``place``, names the
+    longest gap.
+    """
+    if rows <= max(GRID_ROWS, GRID_ROWS_PER_SAMPLE * sample_count):
+        return
+    after = int(np.argmax(np.diff(t_ns))) if len(t_ns) > 1 else 0
+    gap_s = float(t_ns[after + 1] - t_ns[after]) / 1e9 if len(t_ns) > 1 else 0.0
+    raise TacpipeError(
+        f"{place}: the grid would have {rows:,} rows, more than {GRID_ROWS_PER_SAMPLE} for each of {sample_count:,} "
+        f"samples. The longest gap is {gap_s:,.0f} s, after sample {after:,}. Give a lower rate, or divide the recording "
+        f"there."
+    )
 
 
 def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:

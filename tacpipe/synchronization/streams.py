@@ -19,7 +19,7 @@ from tacpipe.io.spill import MappedArrays
 from tacpipe.plugins.stage import Attribute
 from tacpipe.signals.clocks import fit_clock, host_times
 from tacpipe.signals.repairs import HALF, RANGE, count_wraps
-from tacpipe.signals.resampling import uniform_offsets
+from tacpipe.signals.resampling import expect_grid_of_samples, uniform_offsets
 from tacpipe.signals.sampling import spread_times
 from tacpipe.synchronization.placement import Placement, are_arrivals
 
@@ -392,6 +392,8 @@ def find_rows(
         last_ns = min(int(stream.t_ns[-1]) for stream in streams.values())
     origin_ns = int(master.arrival_ns[0]) if hold_values else int(master.t_ns[0])
     count = len(master.t_ns) if rate_hz is None else max(0, int((last_ns - origin_ns) * rate_hz / 1e9) + 2)
+    samples = max(len(stream.t_ns) for stream in streams.values())
+    expect_grid_of_samples(count, samples, master.t_ns, f"Recording {recording}, stream {master.name}")
     t_ns, arrival_ns, numbers = (storage.empty((count,), np.int64) for _ in range(3))
     row_count = 0
     for first in range(0, count, POINTS):

@@ -26,6 +26,7 @@ from tacpipe.video.stream import (
     DAMAGED,
     DTS,
     KEY_FRAME,
+    MAX_PIXELS,
     PACKET,
     PTS,
     VideoFormat,
@@ -51,6 +52,7 @@ DEMUXERS = {  # FFmpeg's demuxer by extension; the content does not choose it, b
 IMAGE_CODECS = {".jpeg": "mjpeg", ".jpg": "mjpeg", ".png": "png", ".webp": "webp"}  # file extension -> FFmpeg's codec
 IMAGE_DEMUXERS = {"mjpeg": "jpeg_pipe", "png": "png_pipe", "webp": "webp_pipe"}
 MICROSECOND = Fraction(1, 10**6)  # unit of the presentation times of images
+MAX_STREAMS = 16  # number of streams of a file to which limits apply
 UNCHECKED = ("vp8",)  # codecs whose decoders do not notice damage
 WITHOUT_PTS = ("avi", "mjpeg")  # demuxers of files without presentation times
 NOMINAL = "from nominal rate"  # origin of timestamps computed from a file's frame rate
@@ -448,7 +450,9 @@ def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
         if not path.stat().st_size:
             raise TacpipeError(f"{path} is empty. Copy it again from its source, or leave it out.")
         try:
-            with av.open(file, format=demuxer or DEMUXERS[path.suffix.lower()]) as container:
+            # opening decodes the first frames of some codecs
+            limits = [{"max_pixels": str(MAX_PIXELS)}] * MAX_STREAMS
+            with av.open(file, format=demuxer or DEMUXERS[path.suffix.lower()], stream_options=limits) as container:
                 yield container
         except (av.error.FFmpegError, ValueError) as error:
             reason = plain(str(getattr(error, "strerror", None) or error), 100)
@@ -472,7 +476,8 @@ def _read_video_format(path: Path, video: Any) -> VideoFormat:
         )
     if not (context.width and context.height and video.time_base):
         raise TacpipeError(
-            f"{path} does not state the size of its frames. Copy it again from its source, or leave it out."
+            f"{path} does not state the size of its frames, or they have more than {MAX_PIXELS:,} pixels. Copy it again "
+            f"from its source, reduce it, or leave it out."
         )
     return VideoFormat(
         context.codec.canonical_name,

@@ -173,3 +173,12 @@ def test_the_median_step_of_many_samples_is_that_of_all_steps_at_once(
     monkeypatch.setattr(resampling, "STEPS_AT_ONCE", 10)
     assert resampling.median_step_ns(t_ns) == np.median(np.diff(t_ns))
     assert resampling.median_step_ns(t_ns[:1]) == 0
+
+
+def test_a_grid_over_a_long_gap_is_refused_and_names_it() -> None:
+    t_ns = np.array([0, 1, 2, 10_000_000, 10_000_001]) * 10**9
+    resampling.expect_grid_of_samples(resampling.GRID_ROWS, 5, t_ns, "here")
+    with pytest.raises(
+        TacpipeError, match=r"^here: the grid would have 10,000,002 rows, .* 9,999,998 s, after sample 2"
+    ):
+        resampling.expect_grid_of_samples(10_000_002, 5, t_ns, "here")

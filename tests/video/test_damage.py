@@ -1,6 +1,8 @@
 """Damaged and cut videos: each frame is that of the sound file, or it has no image and is counted."""
 
 import io
+import zlib
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -190,3 +192,36 @@ def test_a_cut_trial_is_left_out_with_skip_bad(lab: Lab) -> None:
     assert list(lab.manifest("rec").recordings) == ["lemon-1"]
     lab.run("ingest gelsight-slip source -o all --accept-cut")
     assert len(lab.manifest("all").recordings) == 2
+
+
+def test_the_size_of_an_image_is_checked_before_it_is_decoded(tmp_path: Path) -> None:
+    image = videos.images(1)[0]
+    with av.open(str(tmp_path / "0.png"), "w", format="image2") as container:
+        stream = container.add_stream("png")
+        stream.height, stream.width, stream.pix_fmt = image.shape[0], image.shape[1], "rgb24"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+    content = (tmp_path / "0.png").read_bytes()
+    header = b"IHDR" + (16_380).to_bytes(4) + (16_000).to_bytes(4) + content[24:29]
+    (tmp_path / "0.png").write_bytes(content[:12] + header + zlib.crc32(header).to_bytes(4) + content[33:])
+    with pytest.raises(TacpipeError, match="more than 16,777,216 pixels"):
+        files.scan_images([tmp_path / "0.png"])
+
+
+def test_a_video_with_a_gap_of_months_takes_no_memory_for_it(lab: Lab) -> None:
+    (lab.folder / "source").mkdir()
+    with av.open(str(lab.folder / "source" / "a.mkv"), "w") as container:
+        stream = container.add_stream("mjpeg", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for number, image in enumerate(videos.images(30)):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.time_base, frame.pts = Fraction(1, 25), number if number < 15 else number + 270_000_000
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    (lab.folder / "l.toml").write_text(
+        '[streams.gel]\nfiles = "{trial}.mkv"\nformat = "video"\ntime = { rate_hz = 25 }\n'
+    )
+    lab.run("ingest table source --layout l.toml -o rec")
+    assert tacpipe.open("rec")["a"].table("gel")["t_ns"][-1].as_py() == round(270_000_029 * 1e9 / 25)
+    lab.run("extract difference rec -o gel")
+    for command in ("synchronize gel --rate-hz 25 -o grid", "export lerobot gel --rate-hz 25 -o lr"):
+        assert "the grid would have 270,000,031 rows" in lab.call(command).err

@@ -487,10 +487,8 @@ def camera_batches(
                 f"{path} has {count} frames, and {plain(stream.time.file)} has {len(t_ns)} stamps. Copy both again."
             )
     elif stream.time.rate_hz is not None:
-        offsets_ns = resampling.uniform_offsets(
-            0, count if numbers is None else int(numbers[-1]) + 1, stream.time.rate_hz
-        )
-        t_ns, origin = offsets_ns if numbers is None else offsets_ns[numbers], "from rate"
+        frame_numbers = np.arange(count) if numbers is None else numbers
+        t_ns, origin = resampling.offsets_of_numbers(frame_numbers, stream.time.rate_hz), "from rate"
     elif frames is not None:
         t_ns, origin = frames.times_ns(), frames.stamp_origin()
     else:
