@@ -27,6 +27,7 @@ AXES = ("x", "y", "z")
 COMPONENTS = ("x", "y", "z", "w")
 # metadata of ``t_ns``: whether times are arrivals or sampling times, and the declared period in ns
 STAMPS, ARRIVAL, PERIOD = "stamps", "arrival", "period_ns"
+DAMAGED = "damaged"  # mask of the damaged frames of a stream
 
 
 def time_field(origin: str | None = None, *, arrivals: bool = False, period_ns: int | None = None) -> pa.Field:

@@ -218,7 +218,8 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
     """Return the figures of a stream; ``clocks`` are its clocks, or None if it has no times."""
     import pyarrow as pa
 
-    from tacpipe.video.stream import DAMAGED, read_format
+    from tacpipe.channels.schema import DAMAGED
+    from tacpipe.video.stream import read_format
 
     figures: StreamFigures = {"rows": columns.num_rows, "columns": len(columns.column_names)}
     if clocks is not None:

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 import numpy as np
 
 from tacpipe.arrays import Bytes, Floats, Int64s
+from tacpipe.channels.schema import DAMAGED
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
 from tacpipe.video.stream import (
     BATCH_ROWS,
-    DAMAGED,
     DTS,
     KEY_FRAME,
     PACKET,

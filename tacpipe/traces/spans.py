@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Times
-from tacpipe.channels.schema import field_metadata
+from tacpipe.channels.schema import DAMAGED, field_metadata
 from tacpipe.channels.streams import GAP, gaps_before
 from tacpipe.traces.curves import TIME
 
@@ -40,7 +40,7 @@ class FaultMark(NamedTuple):
 
 
 def label_spans(table: pa.Table) -> list[Span]:
-    """Return the spans in which each label column of a table is constant, lane by lane.
+    """Return the spans in which each label column of a table is constant, lane by lane, and those of damaged frames.
 
     The spans of a column of 0 and 1 have the column's name as text. Those of other columns, such as ``contact`` with
     numbers from 0, have name and value; there, -1, null and the empty string are not spans.
@@ -50,7 +50,8 @@ def label_spans(table: pa.Table) -> list[Span]:
     t_ns = table.column(TIME).to_numpy()
     spans = []
     for field in table.schema:
-        if field_metadata(field).get("quantity") == "label" and field.name != TIME:
+        is_label = field_metadata(field).get("quantity") == "label" or field.name == DAMAGED
+        if is_label and field.name != TIME:
             spans += _column_spans(str(field.name), table.column(field.name), t_ns)
     return spans
 

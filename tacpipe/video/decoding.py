@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Floats
+from tacpipe.channels.schema import DAMAGED
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.printable import plain
 from tacpipe.video.encoding import RGB, JpegEncoder
 from tacpipe.video.stream import (
     BATCH_ROWS,
-    DAMAGED,
     DTS,
     KEY_FRAME,
     MAX_PIXELS,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Int64s, Times
+from tacpipe.channels.schema import DAMAGED
 from tacpipe.errors import TacpipeError
 from tacpipe.io import regular
 from tacpipe.plugins import extras
@@ -23,7 +24,6 @@ from tacpipe.video import lengths
 from tacpipe.video.decoding import NEEDED_BY, damaged_frames, error_messages, open_decoder
 from tacpipe.video.stream import (
     BATCH_ROWS,
-    DAMAGED,
     DTS,
     KEY_FRAME,
     MAX_PIXELS,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.channels.schema import DAMAGED
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals.runs import runs
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 PACKET, PTS, DTS, KEY_FRAME = "packet", "pts", "dts", "key_frame"
-DAMAGED = "damaged"  # column of streams with damaged frames
 BATCH_ROWS = 64  # number of encoded frames in memory at once
 MAX_SIDE_PX = 1 << 14  # maximum width and height of a frame
 MAX_PIXELS = 1 << 24  # maximum size of a frame, whose image then has 50 MB; 4096 x 4096 pixels

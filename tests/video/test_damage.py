@@ -11,10 +11,11 @@ import pytest
 
 import tacpipe
 from tacpipe.arrays import Bytes
+from tacpipe.channels.schema import DAMAGED
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.video_checks import VideoChecks, check_videos
+from tacpipe.traces.spans import label_spans
 from tacpipe.video import decoding, files, lengths
-from tacpipe.video.stream import DAMAGED
 from tests.conftest import Lab
 from tests.formats import video_files
 from tests.video import videos
@@ -90,10 +91,12 @@ def test_damage_ends_at_the_next_key_frame(tmp_path: Path) -> None:
     path = videos.write(tmp_path / "a.avi", "mpeg4", COUNT)
     damage(path, 15)
     frames = files.scan(path)
-    damaged = np.flatnonzero(files.read_stream(path, frames, frames.times_ns(), None, []).read_all()[DAMAGED])
+    table = files.read_stream(path, frames, frames.times_ns(), None, []).read_all()
+    damaged = np.flatnonzero(table[DAMAGED])
     keys = np.flatnonzero(frames.key_frame)
     assert keys.tolist()[:3] == [0, 12, 24]
     assert damaged[0] > 12 and damaged[-1] == 23
+    assert [(span.lane, span.stop_ns) for span in label_spans(table)][-1] == (DAMAGED, 24 * 40_000_000)
 
 
 def test_without_verification_frames_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
