@@ -451,7 +451,7 @@ def _open_input(path: Path, demuxer: str = "") -> Iterator[Any]:
             raise TacpipeError(f"{path} is empty. Copy it again from its source, or leave it out.")
         try:
             # opening decodes the first frames of some codecs
-            limits = [{"max_pixels": str(MAX_PIXELS)}] * MAX_STREAMS
+            limits: Any = [{"max_pixels": str(MAX_PIXELS)}] * MAX_STREAMS
             with av.open(file, format=demuxer or DEMUXERS[path.suffix.lower()], stream_options=limits) as container:
                 yield container
         except (av.error.FFmpegError, ValueError) as error:
