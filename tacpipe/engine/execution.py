@@ -143,8 +143,10 @@ def _counted_rows(stage: AnyStage, returned: Result, result: StoredResult, tally
     stated = [output.rows for output in outputs if output.rows is not None]
     stated += [{stream: counts} for (_, stream), counts in tally.counts.items()]
     if not stated and stage.argument("Recording"):
-        shards = result["recordings"][""]["shards"]
-        stored = {stream: shard.get("rows") for stream, shard in shards.items()}
+        entry = result["recordings"].get("")
+        if entry is None:  # the result is files
+            return None
+        stored = {stream: shard.get("rows") for stream, shard in entry["shards"].items()}
         if any(stored.get(stream, stored.get("")) != rows for (_, stream), rows in tally.opened.items()):
             return None
         stated = [{stream: RowCounts.all_used(rows)} for (_, stream), rows in tally.opened.items()]
