@@ -41,6 +41,8 @@ from tests.formats.bags import writers
 from tests.formats.lerobot import files as lerobot_files
 from tests.promises.counts import count
 from tests.promises.limits import is_sentence
+from tests.video import videos
+from tests.video.test_damage import damage
 
 LAYOUT = '[streams.a]\nfiles = "{trial}.%s"\ntime = { column = "t" }\ncolumns = [{ match = "a*", unit = "N" }]\n'
 RATE = '[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n'
@@ -441,7 +443,12 @@ DAMAGED: dict[str, list[Case] | str] = {
             "labels_fold_0.npy",
         )
     ],
-    "gelsight-slip": "files of video have no checksums; packets are stored as they lie in the file",
+    "gelsight-slip": [
+        Case(
+            lambda folder: damage(video_files.write_gelsight(folder) / "camera_0.avi", 5),
+            r"camera_0\.avi: 8 of 13 frames are damaged \(4 to 11\)",
+        )
+    ],
     "vision2tactile": [Case(_change(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
     "xela-flat": [
         Case(_change(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
@@ -832,6 +839,16 @@ def _many_points(folder: Path) -> None:
     path.write_bytes(re.sub(rb"POINTS \d+", b"POINTS 1000000000000", path.read_bytes()))
 
 
+def _large_frames(folder: Path) -> None:
+    """Write a trial with a video whose headers and JPEG images state 16,000 x 16,000 pixels."""
+    path = videos.write(video_files.write_gelsight(folder) / "camera_0.avi", "mjpeg", video_files.FRAMES + 1)
+    content, side_px = path.read_bytes(), 16_000
+    for kind, sides in (("<II", (videos.WIDTH, videos.HEIGHT)), (">HH", (videos.HEIGHT, videos.WIDTH))):
+        assert struct.pack(kind, *sides) in content
+        content = content.replace(struct.pack(kind, *sides), struct.pack(kind, side_px, side_px))
+    path.write_bytes(content)
+
+
 AT_ONCE = "declares .* GB that would be read at once"
 DECLARED: dict[str, list[Case] | str] = {
     "lerobot": [Case(_wide_template, "data_path|not there"), Case(_long_texts_of_episodes, AT_ONCE)],
@@ -873,7 +890,7 @@ DECLARED: dict[str, list[Case] | str] = {
             "icub_fold_0.npy",
         )
     ],
-    "gelsight-slip": "packets are no larger than their file, and frames have a largest size",
+    "gelsight-slip": [Case(_large_frames, "16000 x 16000 pixels .* at most 16,777,216 in all")],
     "vision2tactile": [Case(_many_points, ".pcd")],
     "xela-flat": [
         Case(
@@ -943,6 +960,14 @@ def _cut_workbook(folder: Path) -> None:
     _workbook(folder, lambda sheet: sheet[: len(sheet) // 2])
 
 
+def _changed_sheet(old: bytes, new: bytes) -> Callable[[Path], None]:
+    def change(sheet: bytes) -> bytes:
+        assert old in sheet
+        return sheet.replace(old, new, 1)
+
+    return lambda folder: _workbook(folder, change)
+
+
 def _entity_bomb(folder: Path) -> None:
     entities = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10 if n else "a" * 40}">' for n in range(9))
     bomb = f'<?xml version="1.0"?><!DOCTYPE a [{entities}]><worksheet><v>&e8;</v></worksheet>'
@@ -986,6 +1011,11 @@ def _video_of_text(folder: Path) -> None:
     [
         ("table", Case(_cut_workbook, r"left out bad: bad\.xlsx cannot be read: ParseError", LAYOUT % "xlsx")),
         ("table", Case(_entity_bomb, r"left out bad: bad\.xlsx cannot be read: ParseError", LAYOUT % "xlsx")),
+        ("table", Case(_changed_sheet(b'r="2"', b'r="9999999"'), "row 9999999 follows row 1, has a", LAYOUT % "xlsx")),
+        ("table", Case(_changed_sheet(b'"B3"', b'"A3"'), "row 3 follows row 2, .* two of one column", LAYOUT % "xlsx")),
+        ("table", Case(_changed_sheet(b'r="3"', b'r="2"'), "row 2 follows row 2", LAYOUT % "xlsx")),
+        ("table", Case(_changed_sheet(b't="n"', b't="s"'), "there is no text|list index", LAYOUT % "xlsx")),
+        ("table", Case(_changed_sheet(b't="n"', b't="x"'), "has a cell of the unknown type 'x'", LAYOUT % "xlsx")),
         ("lerobot", Case(_wrong_shape([2**62, 2**62]), "left out bad: bad/meta/info.json: the feature action")),
         ("lerobot", Case(_wrong_shape([-1]), "left out bad: bad/meta/info.json: the feature action")),
         ("lerobot", Case(_video_of_text, r"left out bad-episode_000000: .*top\.txt cannot be read as a video")),

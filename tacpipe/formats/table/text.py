@@ -326,6 +326,7 @@ def describe_type(kind: pa.DataType) -> str:
 
 
 BLOCK_ROWS = 1 << 14
+CELL_TYPES = {"n", "s", "b", "d", "e", "str", "inlineStr"}  # ISO/IEC 29500, ST_CellType
 
 
 @dataclass(frozen=True)
@@ -344,9 +345,7 @@ class Workbook:
             first = next(rows, None)
             if first is None:
                 raise TacpipeError(f"{self.path} has no row. Remove it, or record it again.")
-            cells = list(first[1])
-            while cells and cells[-1] is None:
-                cells.pop()
+            cells = [first[1].get(column) for column in range(1, max(first[1]) + 1)]
         if self.stream.names:
             return list(self.stream.names)
         if not self.stream.header:
@@ -365,7 +364,7 @@ class Workbook:
                 next(rows, None)
             while block := list(itertools.islice(rows, BLOCK_ROWS)):
                 yield pa.table(
-                    {name: self._column(name, kind, block, names.index(name)) for name, kind in types.items()}
+                    {name: self._column(name, kind, block, names.index(name) + 1) for name, kind in types.items()}
                 )
 
     def place(self, index: int) -> str:
@@ -375,14 +374,14 @@ class Workbook:
             return f"row {next(itertools.islice(numbers, index + self.stream.header, None))}"
 
     def _column(
-        self, name: str, kind: pa.DataType, block: list[tuple[int, tuple[Any, ...]]], column_index: int
+        self, name: str, kind: pa.DataType, block: list[tuple[int, dict[int, Any]]], column_number: int
     ) -> pa.Array:
         """Return the cells of a column: strings and booleans as ``kind``, numbers as floats, timestamps as in the sheet.
 
         Raises `TacpipeError` for the first cell of another type.
         """
         missing = ("", *self.stream.missing)
-        cells = [row_cells[column_index] if column_index < len(row_cells) else None for _, row_cells in block]
+        cells = [row_cells.get(column_number) for _, row_cells in block]
         cells = [None if isinstance(cell, str) and cell in missing else cell for cell in cells]
         if pa.types.is_string(kind) and any(isinstance(cell, str) for cell in cells):
             return pa.array([cell if cell is None else str(cell) for cell in cells], kind)
@@ -402,10 +401,10 @@ class Workbook:
             ) from None
 
     @contextlib.contextmanager
-    def _open_rows(self) -> Iterator[Iterator[tuple[int, tuple[Any, ...]]]]:
-        """Open the workbook in the block, and yield the number and the cells of each nonempty row below the lines to skip.
+    def _open_rows(self) -> Iterator[Iterator[tuple[int, dict[int, Any]]]]:
+        """Open the workbook in the block, and yield each nonempty row below the lines to skip: its number, and its cells.
 
-        Raises `TacpipeError` if the file is not a workbook or lacks the sheet.
+        Cells are by the number of their column. Raises `TacpipeError` if the file is not a workbook or lacks the sheet.
         """
         with extras.explain_missing("Reading .xlsx"):
             import openpyxl
@@ -418,13 +417,55 @@ class Workbook:
                         f"{self.path} has no sheet {plain(sheet)}; it has {listed(book.sheetnames, 6)}. Correct sheet in "
                         f"[streams.{self.stream.name}]."
                     )
-                rows = enumerate(book[sheet].iter_rows(values_only=True), 1)
                 yield (
                     (number, cells)
-                    for number, cells in rows
-                    if number > self.stream.skip_lines and any(cell is not None for cell in cells)
+                    for number, cells in self._numbered_rows(book[sheet])
+                    if number > self.stream.skip_lines and cells
                 )
-        except (zipfile.BadZipFile, KeyError, ValueError, openpyxl.utils.exceptions.InvalidFileException) as error:
+        except (zipfile.BadZipFile, LookupError, ValueError, openpyxl.utils.exceptions.InvalidFileException) as error:
             raise TacpipeError(
                 f"{self.path} is not an Excel workbook: {plain(str(error), 200)}. Copy it again."
             ) from error
+
+    def _numbered_rows(self, sheet: Any) -> Iterator[tuple[int, dict[int, Any]]]:
+        """Yield number and cells of each row of a sheet, as `_open_rows` does.
+
+        openpyxl leaves out rows and cells whose numbers do not increase or are outside of the range that the sheet
+        states, and fills in those that are skipped. Raises `TacpipeError` for such numbers, and `IndexError` for a
+        wrong number of a text.
+        """
+        from openpyxl.worksheet._reader import WorkSheetParser
+
+        book = sheet.parent
+        previous = 0
+        with sheet._get_source() as source:
+            parser = WorkSheetParser(
+                source,
+                _SharedTexts(sheet._shared_strings),
+                data_only=True,
+                epoch=book.epoch,
+                date_formats=book._date_formats,
+                timedelta_formats=book._timedelta_formats,
+            )
+            for number, row in parser.parse():
+                cells = {cell["column"]: cell["value"] for cell in row}
+                if unknown := {cell["data_type"] for cell in row} - CELL_TYPES:
+                    raise TacpipeError(
+                        f"{self.path}, row {number} has a cell of the unknown type {excerpt(min(unknown))}. Copy it again."
+                    )
+                if len(cells) < len(row) or {cell["row"] for cell in row} - {number} or number <= previous:
+                    raise TacpipeError(
+                        f"{self.path}: row {number} follows row {previous}, has a cell of another row, or has two of one "
+                        f"column. Open the workbook in a spreadsheet program and save it again."
+                    )
+                previous = number
+                yield number, {column: value for column, value in cells.items() if value is not None}
+
+
+class _SharedTexts(list[str]):
+    """The texts of a workbook by number, from 0."""
+
+    def __getitem__(self, index: Any) -> Any:
+        if index < 0:
+            raise IndexError(f"there is no text {index}")
+        return super().__getitem__(index)
