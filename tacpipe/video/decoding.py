@@ -47,6 +47,8 @@ DECODERS = {"av1": "libdav1d", "vp9": "libvpx-vp9"}
 # codecs that never write `ZEROS` in a row: start codes must not appear in their data, or it is coded arithmetically
 WITHOUT_ZEROS = ("av1", "h264", "hevc", "mpeg4", "vp8", "vp9")
 ZEROS = bytes(64)
+# markers of JPEG images (ITU-T T.81, annex B), of which none appears in the data of a scan
+START_OF_IMAGE, START_OF_SCAN, END_OF_IMAGE = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 STRICT = ("hevc",)  # codecs whose decoder reports most damage only if an error ends the decoding of a frame
 GREY = "gray"  # FFmpeg's name of the grey pixel format
 
@@ -267,7 +269,11 @@ class FrameDecoder:
 
 
 def has_lost_block(codec: str, packet: bytes) -> bool:
-    """Return whether a packet contains zeros that its codec does not write."""
+    """Return whether a packet is a JPEG image without start or end, or contains zeros that its codec does not write."""
+    if codec == "mjpeg" and (
+        not packet.startswith(START_OF_IMAGE) or packet.find(END_OF_IMAGE, packet.rfind(START_OF_SCAN)) < 0
+    ):
+        return True
     if ZEROS not in packet:
         return False
     return codec in WITHOUT_ZEROS or (codec == "mjpeg" and not _codes_flat_blocks_as_zeros(packet))

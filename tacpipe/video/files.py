@@ -279,8 +279,8 @@ def read_stream(
 ) -> pa.RecordBatchReader:
     """Return the stream of frames of a file, read on demand; ``t_ns`` (frame,) are the timestamps.
 
-    ``stamp_origin`` is the origin of timestamps that do not come from a clock. Notes on damaged frames, and on frames that
-    the file does not hold, are added to ``notes``. Raises `TacpipeError` if the file cannot be read, also while the
+    ``stamp_origin`` is the origin of timestamps that do not come from a clock. Notes on damaged frames, and on those
+    that the file does not hold, are added to ``notes``. Raises `TacpipeError` if the file cannot be read, also while the
     stream is read.
     """
     clocks, counter = (frames.pts, frames.dts, frames.key_frame), frames.counter()
@@ -293,6 +293,8 @@ def read_stream(
         notes.append(
             f"{path} is cut after frame {len(frames):,} of {len(frames) + frames.cut_frames:,}; the rest is missing."
         )
+    if DEMUXERS[path.suffix.lower()] == "matroska" and (lost_bytes := lengths.foreign_bytes(path)):
+        notes.append(f"{path} is damaged: {lost_bytes:,} bytes are not Matroska, and frames in them are missing.")
     return _verified(read, frames.video_format, frames.suspect, path, notes)
 
 

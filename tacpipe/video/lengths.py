@@ -55,15 +55,47 @@ def _riff_size(head: bytes) -> int:
     return 8 + body_bytes + body_bytes % 2 if head[:4] == b"RIFF" and body_bytes else 0
 
 
-def _ebml_size(head: bytes) -> int:
-    """Return the size of an EBML element, header included, or 0 if it states none."""
+def foreign_bytes(path: Path) -> int:
+    """Return the size of the elements in the segment and the clusters of a Matroska file that Matroska does not know.
+
+    FFmpeg skips them without a message, with the frames that they may have held before their name was damaged.
+    """
+    lost, at = 0, 0
+    with regular.opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        while at < size:
+            file.seek(at)
+            name, head_bytes, body_bytes = _ebml_head(file.read(HEAD_BYTES))
+            end = size if body_bytes is None else min(size, at + head_bytes + body_bytes)
+            if not name:
+                break
+            lost += 0 if name in _NESTING or name in _ELEMENTS else end - at
+            at = at + head_bytes if name in _NESTING else end
+    return lost
+
+
+_NESTING = ("18538067", "1F43B675")  # segment and cluster
+_ELEMENTS = (  # RFC 9559: those of a file, a segment and a cluster, and those that any element may have
+    *("1A45DFA3", "114D9B74", "1549A966", "1654AE6B", "1C53BB6B", "1941A469", "1043A770", "1254C367"),
+    *("E7", "5854", "A7", "AB", "A3", "A0", "AF", "EC", "BF"),
+)
+
+
+def _ebml_head(head: bytes) -> tuple[str, int, int | None]:
+    """Return name in hex, size of header and size of body of an EBML element: None if unknown; no name if it is none."""
     id_bytes = 9 - head[0].bit_length()
     if not 1 <= id_bytes <= 4 or len(head) <= id_bytes or not head[id_bytes]:
-        return 0
+        return "", 0, 0
     size_bytes = 9 - head[id_bytes].bit_length()
     body_bytes = int.from_bytes(head[id_bytes : id_bytes + size_bytes]) & ((1 << 7 * size_bytes) - 1)
     is_unknown = body_bytes == (1 << 7 * size_bytes) - 1
-    return 0 if is_unknown else id_bytes + size_bytes + body_bytes
+    return head[:id_bytes].hex().upper(), id_bytes + size_bytes, None if is_unknown else body_bytes
+
+
+def _ebml_size(head: bytes) -> int:
+    """Return the size of an EBML element, header included, or 0 if it states none."""
+    _, head_bytes, body_bytes = _ebml_head(head)
+    return 0 if body_bytes is None else head_bytes + body_bytes
 
 
 def _box_size(head: bytes) -> int:

@@ -1,6 +1,7 @@
 """Damaged and cut videos: each frame is that of the sound file, or it has no image and is counted."""
 
 import io
+import re
 import zlib
 from fractions import Fraction
 from pathlib import Path
@@ -85,6 +86,30 @@ def test_a_lost_sector_is_refused_or_each_frame_equals_that_of_the_sound_file_or
             assert np.flatnonzero(table[DAMAGED]).tolist() == without_image
             assert f"{len(without_image)} of {len(frames)} frames are damaged" in notes[0]
     assert marked_count
+
+
+@pytest.mark.parametrize("shift", [-8, 8])
+def test_jpeg_images_that_lack_their_start_or_end_are_damaged(shift: int, tmp_path: Path) -> None:
+    path = videos.write(tmp_path / "a.mp4", "mjpeg")
+    content = bytearray(path.read_bytes())
+    at = content.index(b"stco") + 12
+    content[at : at + 4] = (int.from_bytes(content[at : at + 4]) + shift).to_bytes(4)
+    path.write_bytes(content)
+    frames = files.scan(path)
+    with pytest.raises(TacpipeError, match="none of the 30 frames can be decoded as mjpeg"):
+        files.read_stream(path, frames, frames.times_ns(), None, [])
+
+
+def test_frames_in_elements_that_matroska_does_not_know_are_noted(tmp_path: Path) -> None:
+    path, notes = videos.write(tmp_path / "a.mkv", "mjpeg"), list[str]()
+    content = path.read_bytes()
+    packet = videos.packets(path)[20]
+    header = content.rindex(b"\xa3", 0, content.index(packet))
+    path.write_bytes(content[:header] + b"\xa2" + content[header + 1 :])
+    frames = files.scan(path)
+    files.read_stream(path, frames, frames.times_ns(), None, notes)
+    assert len(frames) == 29
+    assert re.search(r"a\.mkv is damaged: [\d,]+ bytes are not Matroska, and frames in them are missing", notes[0])
 
 
 def test_damage_ends_at_the_next_key_frame(tmp_path: Path) -> None:
