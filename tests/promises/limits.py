@@ -15,13 +15,13 @@ LONGEST = 900  # letters of a sentence, a path of a test's folder in it
 
 
 @contextlib.contextmanager
-def bound_memory(memory: int = 2 * GIB) -> Iterator[None]:
+def bound_memory(memory: int = 2 * GIB, ends_s: int = ENDS_S) -> Iterator[None]:
     """Let what runs in the block take so many bytes more of address space, and end."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = signal.signal(signal.SIGALRM, _overdue)
     resource.setrlimit(resource.RLIMIT_AS, (used_bytes + memory, hard))
-    signal.alarm(ENDS_S)
+    signal.alarm(ends_s)
     try:
         yield
     finally:
