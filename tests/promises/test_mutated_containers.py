@@ -115,6 +115,7 @@ def _of(grammar: structures.Grammar) -> Callable[[bytes, int], Iterator[tuple[st
 
 
 TABLE = "ingest table source --layout layout.toml"
+# Matroska does not count frames: a frame of MPEG-4 that is removed from it as a whole changes those after it unseen
 CONTAINERS = {
     "MP4, MJPEG": Container(_video("mp4", "mjpeg"), _of(structures.BOXES), TABLE, VIDEO_LAYOUT % "mp4"),
     "MP4, MPEG-4": Container(_video("mp4", "mpeg4"), _of(structures.BOXES), TABLE, VIDEO_LAYOUT % "mp4"),
