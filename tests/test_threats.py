@@ -17,14 +17,20 @@ from tests.conftest import Lab, write_plugin, write_source
 PLUGIN = "open('ran', 'w').close()\nraise SystemExit(9)\n"
 
 
-def test_a_plug_in_in_a_project_folder_is_not_loaded(tmp_path: Path) -> None:
+@pytest.fixture
+def command() -> Path:
+    """Return the command tacpipe; `python -m tacpipe` also imports from the working directory."""
+    path = Path(sys.executable).with_name("tacpipe")
+    if not path.exists():
+        pytest.skip("the command tacpipe is not installed next to this Python")
+    return path
+
+
+def test_a_plug_in_in_a_project_folder_is_not_loaded(tmp_path: Path, command: Path) -> None:
     points = "\n".join(
         f"[tacpipe.{group}]\nhostile = hostile:it" for group in ("stages", "formats", "sensors", "tasks")
     )
     write_plugin(tmp_path, "hostile", points, hostile=PLUGIN)
-    command = Path(sys.executable).with_name("tacpipe")
-    if not command.exists():
-        pytest.skip("the command tacpipe is not installed next to this Python")
     for words in (["--help"], ["sensors", "list"], ["hostile", "x"]):
         ran = subprocess.run(
             [command, *words],
@@ -35,6 +41,22 @@ def test_a_plug_in_in_a_project_folder_is_not_loaded(tmp_path: Path) -> None:
             check=False,
         )
         assert ran.returncode in (0, 2) and "hostile" not in ran.stdout and not (tmp_path / "ran").exists(), words
+
+
+def test_worker_processes_import_no_module_of_the_working_directory(tmp_path: Path, command: Path) -> None:
+    for name in ("multiprocessing", "numpy", "tacpipe"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write('{name} ')\n{PLUGIN}")
+    words = "simulate forward --trials 8 --duration-s 4 --jobs 2 -o recordings"  # 8 tasks need worker processes
+    for executor in ("local", "dask"):
+        ran = subprocess.run(
+            [command, *words.split(), "--executor", executor, "--quiet"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        shutil.rmtree(tmp_path / ".tacpipe", ignore_errors=True)
+        assert ran.returncode == 0 and not (tmp_path / "ran").exists(), ran.stderr
 
 
 def test_no_manifest_holds_a_path_of_the_computer_or_its_name(lab: Lab) -> None:

@@ -31,7 +31,7 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     extras.require("The demo on a rig", *LEARNING, *LINKS)
     emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
     terminal.note("$ tacpipe " + " ".join(emulate) + " &")
-    serving = subprocess.Popen([sys.executable, "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
+    serving = subprocess.Popen([sys.executable, "-P", "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
     try:
         if not serving.stdout.readline():  # The command prints the path of its rig file once all streams are served.
@@ -50,7 +50,7 @@ def _run(commands: list[list[str]]) -> None:
     for command in commands:
         terminal.note("$ tacpipe " + " ".join(command))
         quiet = [] if command[0] == "show" else ["--quiet"]
-        process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
+        process = subprocess.Popen([sys.executable, "-P", "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
         with termination.reporting(""):  # The command itself reports interrupts.
             try:
                 code = process.wait()

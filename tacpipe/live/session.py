@@ -200,7 +200,7 @@ class Supervisor:
         ours, theirs = socket.socketpair()
         threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more threads would only compete with the recorder
         environment = {**os.environ, **threads}
-        command = [sys.executable, "-m", MODULE, str(theirs.fileno())]
+        command = [sys.executable, "-P", "-m", MODULE, str(theirs.fileno())]  # -P: not from the working directory
         try:
             self._process = subprocess.Popen(
                 command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True

@@ -26,7 +26,7 @@ from queue import Queue
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.engine import execution, provenance
-from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks
+from tacpipe.engine.executors.local import compute_chunk, divide_into_chunks, without_working_directory
 from tacpipe.engine.keys import Done, WorkerTask
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import terminal, termination
@@ -240,6 +240,7 @@ def _start_workers(workers: int) -> Iterator[Dask]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(quiet())
+            stack.enter_context(without_working_directory())
             stack.enter_context(dask.config.set(NO_PAGES))
             cluster = stack.enter_context(
                 LocalCluster(  # type: ignore[no-untyped-call]

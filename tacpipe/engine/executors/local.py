@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 Task = TypeVar("Task")
 Done = TypeVar("Done")
+SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
 _A_WORKER = 8  # chunks per worker, a compromise between progress and overhead
 
 
@@ -84,13 +85,31 @@ def start_fork_server(preload: Sequence[str]) -> ForkServerContext:
     memory.require_library("pyarrow")  # each process loads it
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(list(preload))
-    resource_tracker.ensure_running()  # the tracker unblocks signals, so it starts before they are blocked
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with without_working_directory():
+        resource_tracker.ensure_running()  # the tracker unblocks signals, so it starts before they are blocked
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return server
+
+
+@contextlib.contextmanager
+def without_working_directory() -> Iterator[None]:
+    """Prevent Python processes that start in the block from importing modules of the working directory.
+
+    Python puts it first on the module path of a process that multiprocessing starts. Sets `SAFE_PATH` in the block.
+    """
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
 
 
 @contextlib.contextmanager

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.engine.executors import dask as dask_workers
+from tacpipe.engine.executors.local import SAFE_PATH
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.plugins import extras
@@ -126,7 +127,11 @@ def _submit_jobs(address: str, jobs: int, security: Security, folder: Path, conf
         nanny=True,  # without it, a worker may hang when it closes
         # one task at a time on all cores of the job; Slurm limits the memory
         worker_extra_args=[*setting("worker-extra-args", []), "--nthreads", "1", "--memory-limit", "0"],
-        job_script_prologue=[*setting("job-script-prologue", []), *(f"export {name}={cores}" for name in _THREADS)],
+        job_script_prologue=[
+            *setting("job-script-prologue", []),
+            f"export {SAFE_PATH}=1",
+            *(f"export {name}={cores}" for name in _THREADS),
+        ],
         job_name="tacpipe",
         log_directory=str(folder),
         protocol="tls://",

@@ -113,7 +113,9 @@ def _train(output: Path, seed: int) -> None:
 
 def _tacpipe(*words: str) -> None:
     terminal.note("$ tacpipe " + " ".join(words))
-    code = subprocess.run([sys.executable, "-m", "tacpipe", *words], stdout=subprocess.DEVNULL, check=False).returncode
+    code = subprocess.run(
+        [sys.executable, "-P", "-m", "tacpipe", *words], stdout=subprocess.DEVNULL, check=False
+    ).returncode
     if code:
         raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
 
