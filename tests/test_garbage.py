@@ -231,6 +231,19 @@ def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> Non
     assert collect_garbage(lab)["objects"] > 0
 
 
+def test_the_fourteen_days_do_not_begin_with_a_clock_from_before_the_root_was_written(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run("simulate toy -o data/r")
+    lab.run("scale data/r -o data/s")
+    Path("data/s").rename("elsewhere")
+    age(lab)
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: 86400.0)  # a computer without a battery starts in 1970
+        collect_garbage(lab)
+    assert collect_garbage(lab)["objects"] == 0
+
+
 def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")

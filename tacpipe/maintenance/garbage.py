@@ -330,10 +330,12 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
 def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been unreachable for the whole grace period.
 
-    The first failed access starts the period, and a successful one resets it.
+    The first failed access starts the period, and a successful one resets it. A clock from before the root was written
+    is wrong and starts none, because the period would have ended when the clock is set.
     """
     now_s = int(time.time())
-    since_s = None if reached else min(root.get("missing_since_s", now_s), now_s)  # the clock may have been set back
+    counts = not reached and now_s >= root.get("written_s", 0)
+    since_s = min(root.get("missing_since_s", now_s), now_s) if counts else None  # the clock may have been set back
     if since_s != root.get("missing_since_s") and not dry_run:
         marked: Root = {**root}
         if since_s is None:
@@ -342,9 +344,7 @@ def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, d
             marked["missing_since_s"] = since_s
         with contextlib.suppress(TacpipeError):
             store.roots.write(marked)
-    if since_s is None:
-        return False
-    return grace_days <= 0 or now_s - since_s > grace_days * 86400
+    return not reached and (grace_days <= 0 or (since_s is not None and now_s - since_s > grace_days * 86400))
 
 
 def _sweep(
