@@ -97,20 +97,20 @@ def read_encoder(weights: bytes) -> Encode:
     Raises `TacpipeError` for other weights.
     """
     try:
-        tensors = load(weights)
-        components = int(tensors[max(tensors)].shape[0])
-        network = _Network(components)
-        network.load_state_dict({**network.state_dict(), **tensors})
+        tensors = {name.removeprefix("encoder."): value.float() for name, value in load(weights).items()}
+        if not all(value.isfinite().all() for value in tensors.values()):
+            raise ValueError("not all of them are finite")
+        with torch.device("meta"):  # takes no memory for a size that the weights only state
+            encoder = _Network(int(tensors[max(tensors)].shape[0])).encoder
+        encoder.load_state_dict(tensors, assign=True)
     except (SafetensorError, ValueError, IndexError, RuntimeError) as error:
         raise TacpipeError(f"The weights do not fit this autoencoder: {plain(str(error), 200)}.") from error
-    network.eval()
+    encoder.eval()
 
     def encode(images: Bytes) -> Float32s:
         reduced = np.stack([reduce_image(image) for image in images]).transpose(0, 3, 1, 2)
         with torch.inference_mode():
-            features: Float32s = network.encoder(
-                _to_unit_range(torch.from_numpy(np.ascontiguousarray(reduced)))
-            ).numpy()
+            features: Float32s = encoder(_to_unit_range(torch.from_numpy(np.ascontiguousarray(reduced)))).numpy()
         return features
 
     return encode

@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load, save
 
 import tacpipe
+from tacpipe.codecs.frame_autoencoder import COLUMNS, ROWS, _Network, read_encoder
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import registry
@@ -259,6 +260,22 @@ def test_weights_of_other_shapes_are_refused(kind: str, change: str) -> None:
             }[change].contiguous()
 
     check_refusal(lambda: evaluate_model(kind, weights(model_files(kind), spoil)))
+
+
+@pytest.mark.parametrize("change", ["lost", "one more", "not finite", "a size without values"])
+def test_weights_of_an_image_encoder_that_do_not_fit_are_refused(change: str) -> None:
+    tensors = {name: value for name, value in _Network(2).state_dict().items() if name.startswith("encoder.")}
+    images = np.full((1, ROWS, COLUMNS, 3), 7, np.uint8)
+    assert read_encoder(save(tensors))(images).shape == (1, 2)
+    if change == "lost":
+        del tensors["encoder.0.bias"]
+    elif change == "one more":
+        tensors["decoder.0.bias"] = torch.zeros(2)
+    elif change == "not finite":
+        tensors["encoder.0.bias"] = torch.full((16,), torch.nan)
+    else:
+        tensors["encoder.7.weight"] = torch.zeros(1 << 40, 0)
+    check_refusal(lambda: read_encoder(save(tensors)), "The weights do not fit this autoencoder")
 
 
 def safetensors(header: Any, body: bytes = b"", length: int | None = None) -> bytes:
