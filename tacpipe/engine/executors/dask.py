@@ -257,6 +257,16 @@ def _start_workers(workers: int) -> Iterator[Dask]:
                 )
             )
             yield Dask(stack.enter_context(Client(cluster, security=security, set_as_default=False)))  # type: ignore[no-untyped-call]
+        except RuntimeError as error:
+            if "failed to start" not in str(error):  # of distributed, which omits the cause
+                raise
+            cause: BaseException = error
+            while earlier := cause.__cause__ or cause.__context__:
+                cause = earlier
+            raise TacpipeError(
+                f"Dask's workers do not start: {cause}. They need /dev/shm and a folder for temporary files that can be "
+                f"written. Or leave out --executor dask."
+            ) from error
         except KeyboardInterrupt:
             if termination.requested():  # closing the cluster takes seconds, and this process is ending
                 _abandoned.append(stack.pop_all())
