@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import (
     DamagedError,
+    DeniedError,
     DeviceError,
     LockedError,
     MissingModuleError,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DamagedError",
     "Dataset",
+    "DeniedError",
     "DeviceError",
     "LockedError",
     "MissingModuleError",
