@@ -9,9 +9,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
 from tacpipe.video.files import IMAGE_CODECS
+from tacpipe.video.images import END, PNG, START
 
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-_JPEG, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+_PNG_END, _JPEG_SCAN = b"IEND\xaeB`\x82", b"\xff\xda"
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -54,9 +54,9 @@ def expect_complete(path: Path) -> None:
         raise TacpipeError(f"{path} is empty. Copy it again from its source, or leave it out.")
     kind = IMAGE_CODECS[path.suffix.lower()]
     if kind == "png":
-        has_header, has_end = content.startswith(_PNG), _PNG_END in content
+        has_header, has_end = content.startswith(PNG), _PNG_END in content
     elif kind == "mjpeg":  # a preview image within the header has an end of its own
-        has_header, has_end = content.startswith(_JPEG), content.rfind(_JPEG_END) > content.rfind(_JPEG_SCAN)
+        has_header, has_end = content.startswith(START), content.rfind(END) > content.rfind(_JPEG_SCAN)
     else:
         has_header = content.startswith(b"RIFF") and content[8:12] == b"WEBP"
         has_end = int.from_bytes(content[4:8], "little") + 8 <= len(content)

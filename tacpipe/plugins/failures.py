@@ -25,7 +25,7 @@ class StageFailure(TypedDict):
     stage: str
     recording: str
     frames: str  # frames of the traceback
-    is_own: bool  # whether tacpipe's own code raised it
+    is_own: bool  # True if tacpipe's own code raised it
 
 
 @contextmanager

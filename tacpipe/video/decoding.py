@@ -187,12 +187,12 @@ class _FramesInOrder:
     video_format: VideoFormat
     started: bool = False
     _key_row: int = 0  # row of the newest key frame
-    _is_group_damaged: bool = False  # whether a frame since the newest key frame is damaged
+    _is_group_damaged: bool = False  # True if a frame since the newest key frame is damaged
     _is_previous_damaged: bool = False  # the same between the two newest key frames
-    _damaged: dict[int, bool] = field(default_factory=dict)  # whether each waiting row is damaged, in decoding order
+    _damaged: dict[int, bool] = field(default_factory=dict)  # True for each damaged row that waits, in decoding order
     _frames: dict[int, Any] = field(default_factory=dict)  # frame by waiting row, of those that the decoder returned
     _returned: int = -1  # last row that the decoder returned; earlier ones without a frame get none
-    _is_complete: bool = False  # whether the decoder has returned all frames
+    _is_complete: bool = False  # True once the decoder has returned all frames
 
     def add(self, row: int, *, is_key_frame: bool, is_damaged: bool, is_marked: bool) -> None:
         """Add a row that the decoder was given. ``is_marked``: whether it is in the stream's mask of damaged frames."""
