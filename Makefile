@@ -84,10 +84,10 @@ touch-uncertainty: $(VENV)/.dev ## measure quantiles of predicted touch on the p
 unknown-materials: $(VENV)/.dev ## measure the answer unknown with materials left out, on the published slides in DATA; a table
 	@$(BIN)/python docs/unknown_materials.py $(DATA)
 
-rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
+rig-demo: $(VENV)/.dev ## replay simulated trials as the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
-live-demo: $(VENV)/.dev ## emulate the first paper's rig with slips and predict them live for 60 s; a summary and live-demo/live.png
+live-demo: $(VENV)/.dev ## replay simulated slips as the first paper's rig and predict them live for 60 s; a summary and live-demo/live.png
 	@$(BIN)/python -m tacpipe.tasks.slip.live.demo live-demo rigs/first-paper.toml
 
 test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 5 minutes on 2 cores
@@ -95,6 +95,9 @@ test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: som
 
 test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the docs' commands
 	@$(PYTEST) -m "long and not faults"
+
+language: $(VENV)/.dev ## print words, names and comments that plainer language may replace; it is advice
+	@$(BIN)/python tests/language.py
 
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
 	@$(PYTEST) -m "rig and not faults"

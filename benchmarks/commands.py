@@ -82,13 +82,9 @@ def _unchanged_chain(place: Path, rounds: int) -> list[timing.Line]:
     def dvc() -> None:
         timing.run("dvc repro", place, DVC_NO_ANALYTICS="1", GIT_CONFIG_GLOBAL=os.devnull)
 
-    def chain() -> None:
-        timing.run("tacpipe run dvc.yaml", place)
-
-    contestants = {"tacpipe": tacpipe, "tacpipe run": chain, "dvc repro": dvc}
+    contestants = {"tacpipe": tacpipe, "dvc repro": dvc}
     times = timing.interleaved(contestants, max(5, rounds // 2))
     case = f"nothing to do in a chain of {len(COMMANDS)} commands"
     return [
         timing.at_most(f"{case}, one process each", times, "tacpipe", "dvc repro"),
-        timing.at_most(f"{case}, `tacpipe run dvc.yaml`", times, "tacpipe run", "dvc repro", 1.0),
     ]

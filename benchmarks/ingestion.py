@@ -123,9 +123,9 @@ def _arrays(folder: Path, rounds: int) -> list[timing.Line]:
 
 def _ingest_arrays(kind: str, place: Path, *, write: bool = False) -> None:
     stage = registry.load(f"ingest.{kind}")
-    assert stage.discover is not None
+    assert stage.source is not None
     params = stage.params()
-    for trial in stage.discover(params, place).values():
+    for trial in stage.source.discover(params, place).values():
         recording = stage(params, files=trial.files, values=trial.values)  # type: ignore[union-attr]
         for table in recording.streams.values():
             if write:

@@ -1,6 +1,6 @@
 """How long forecasts of a live session take while a rig is recorded, and whether its memory stays flat.
 
-    python benchmarks/live_session.py MODEL [--seconds 30] [--load 2] [--nice -5] [--publish udp:127.0.0.1:9999]
+    python -m benchmarks.live_session MODEL [--seconds 30] [--load 2] [--nice -5] [--publish udp:127.0.0.1:9999]
 
 The first paper's rig is emulated with a planner on the same computer (2 uSkin at 50 Hz, proximity at 400 Hz, an arm at
 1 kHz), and `tacpipe live` records it. Latency is from the arrival of the newest sample that was read to publication. With
@@ -28,9 +28,9 @@ import tacpipe
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.simulation import pick_and_move
-from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.slip.live.demo import send_plans
+from tests.emulation.emulator import Emulator
+from tests.emulation.world import World
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
 EFFORT = 1.15  # maximum load of the plan, relative to the friction limit: the plan of each trial causes slip
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         words += ["--realtime"] * arguments.realtime
         words += [word for address in arguments.publish for word in ("--publish", address)]
         command = [sys.executable, "-m", "tacpipe", *words]
-        with send_plans(emulator, port, PLAN_RATE_HZ):
+        with send_plans(lambda t_ns: world.arm(t_ns)[:, 1:], emulator.epoch_ns, port, PLAN_RATE_HZ):
             session = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
             watcher = threading.Thread(target=watch_memory, args=(session, memory), daemon=True)
             watcher.start()

@@ -1,6 +1,6 @@
 """Record an emulated rig for long, as a lab would, and hold every sample against what was sent.
 
-    python benchmarks/rig_endurance.py [--minutes 10] [--busy 4] [--rig rigs/first-paper.toml]
+    python -m benchmarks.rig_endurance [--minutes 10] [--busy 4] [--rig rigs/first-paper.toml]
 
 The rig is emulated here; `tacpipe acquire` runs beside it as a process of its own, whose processor time and memory are
 read from the kernel. With `--busy`, so many other processes use the processor all the time. Everything that was sent
@@ -25,11 +25,10 @@ from typing import Any
 import pyarrow as pa
 
 import tacpipe
-from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import ledger as ledgers
-from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.ledger import Ledger
+from tests.emulation import ledger as ledgers
+from tests.emulation.emulator import SWITCH_S, Emulator
+from tests.emulation.ledger import Ledger
 
 BIN = Path(sys.executable).parent
 TICKS = os.sysconf("SC_CLK_TCK")

@@ -1,6 +1,6 @@
 """Harm the bytes of every sensor for minutes of its own time, and hold what its driver gives against what was sent.
 
-    python benchmarks/rig_faults.py [--minutes 5] [--only tfmini contactile] [--faults noise=1,cut=1]
+    python -m benchmarks.rig_faults [--minutes 5] [--only tfmini contactile] [--faults noise=1,cut=1]
 
 Nothing waits: the clock is the emulator's. A sample that was never sent is an error, unless the harm made a frame that the
 protocol itself takes for good (`invisible`: nothing in it could tell). Printed are, for each sensor, what was done to it,
@@ -23,12 +23,12 @@ from tacpipe.recording import rig as rig_of
 from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tacpipe.simulation.emulation import byte_faults
-from tacpipe.simulation.emulation import ledger as ledgers
-from tacpipe.simulation.emulation.byte_faults import Faults, SentItem
-from tacpipe.simulation.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator, frame_pace
-from tacpipe.simulation.emulation.ledger import Ledger
-from tacpipe.simulation.emulation.transmission import TransmissionPlan
+from tests.emulation import byte_faults
+from tests.emulation import ledger as ledgers
+from tests.emulation.byte_faults import Faults, SentItem
+from tests.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator, frame_pace
+from tests.emulation.ledger import Ledger
+from tests.emulation.transmission import TransmissionPlan
 
 RIG = Path(__file__).parents[1] / "rigs/all-sensors.toml"
 USUAL = Faults(
@@ -170,7 +170,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--only", nargs="+")
-    parser.add_argument("--faults", help="as for `tacpipe sensors emulate`; a little of everything by default")
+    parser.add_argument("--faults", help="such as noise=0.5,drop=0.001; a little of everything by default")
     chosen = parser.parse_args()
     faults = byte_faults.parse(chosen.faults) if chosen.faults else USUAL
     print("| sensor | harmed | given | wrong | invisible | lost | told as lost | not given behind a disturbance |")

@@ -14,15 +14,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
+from scipy.stats import beta
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from tacpipe.arrays import AnyFloats, Floats, Int64s
-from tacpipe.metrics import intervals, pairing
-from tacpipe.metrics.headline import MIN_CLUSTERS
-from tacpipe.metrics.intervals import wilson
-from tacpipe.metrics.pairing import Measure
+from tacpipe.scores import intervals, pairing
+from tacpipe.scores.headline import MIN_CLUSTERS
+from tacpipe.scores.intervals import wilson
+from tacpipe.scores.pairing import Measure
 from tacpipe.tasks.forward import headline as forward
+from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.slip import metrics as slip
 from tacpipe.tasks.slip.calibration import ScoredTrack
 from tacpipe.tasks.slip.windows import BEFORE, STABLE
@@ -226,9 +228,8 @@ def rate_coverage(materials: int, slides: int = 16, repeats: int = REPEATS) -> R
 class AreaCoverage(NamedTuple):
     """Coverage of intervals over objects, of an area under the ROC curve and of the margin over a baseline."""
 
-    percentile: float  # percentile bootstrap over objects
-    jackknife: float  # the interval of `tacpipe.tasks.slip.metrics`
-    margin: float  # the same for the margin
+    area: float
+    margin: float
 
 
 @dataclass(frozen=True)
@@ -280,19 +281,64 @@ def draw_scores(rng: np.random.Generator, objects: int, models: Sequence[ScoreMo
 def area_coverage(objects: int, area: float, repeats: int = REPEATS) -> AreaCoverage:
     """Return the coverage of intervals of areas and margins with some objects."""
     rng, models = np.random.default_rng(objects), (ScoreModel(area), ScoreModel(BASELINE_AREA))
-    draws = rng.multinomial(objects, np.full(objects, 1 / objects), RESAMPLES).astype(np.float64)
-    covered = np.full((repeats, 3), np.nan)
+    layout = slip.AreaLayout(map(str, range(objects)))
+    measure, truths = layout.measure(), (area, area - BASELINE_AREA)
+    covered = np.full((repeats, 2), np.nan)
     for repeat in range(repeats):
-        model, baseline = (slip.WindowScores(tracks) for tracks in draw_scores(rng, objects, models))
-        area_of_model = model.area("before")
-        low, high = np.nanquantile(area_of_model.selected(draws), [0.025, 0.975])
-        ends = slip.area_estimate(area_of_model), slip.margin(model, baseline)
-        truths = area, area - BASELINE_AREA
-        covered[repeat, 0] = low <= area <= high
-        for column, (estimate, truth) in enumerate(zip(ends, truths, strict=True), start=1):
-            if estimate["low"] is not None and estimate["high"] is not None:
-                covered[repeat, column] = estimate["low"] <= truth <= estimate["high"]
+        model, baseline = (
+            windows.sums("before", layout, np.zeros(len(windows.scores)))
+            for windows in map(slip.WindowScores, draw_scores(rng, objects, models))
+        )
+        estimates = pairing.score(measure, model), pairing.difference(measure, model, baseline)
+        for column, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
+            if np.isfinite(estimate.low):
+                covered[repeat, column] = estimate.low <= truth <= estimate.high
     return AreaCoverage(*(float(share) for share in np.nanmean(covered, axis=0)))
+
+
+class ShareCoverage(NamedTuple):
+    """Coverage and mean width of intervals of a difference of two shares, in percentage points."""
+
+    coverage: float
+    width: float
+    jackknife: float  # coverage of the jackknife alone
+
+
+# probabilities that the model and the baseline are right, and the number of answers per cluster
+SHARES = ((0.6, 0.5), (0.8, 0.6), (0.95, 0.9), (0.99, 0.98), (0.97, 0.97), (0.98, 0.2))
+ANSWERS = (1, 16)
+
+
+def share_coverage(clusters: int, shares: tuple[float, float], answers: int, repeats: int = REPEATS) -> ShareCoverage:
+    """Return the coverage of the interval of a gain in points over slides, or over clusters of answers that differ.
+
+    Whether the two are right is correlated (0.5). With several answers, the probabilities of a cluster are drawn from beta
+    distributions.
+    """
+    rng, truth, measure = np.random.default_rng(clusters), 100 * (shares[0] - shares[1]), material.MEASURE
+    found = np.zeros((repeats, 3))
+    for repeat in range(repeats):
+        first = rng.standard_normal(clusters)
+        second = 0.5 * first + np.sqrt(0.75) * rng.standard_normal(clusters)
+        ranks = normal.cdf(np.stack([first, second]))
+        if answers == 1:
+            right = (ranks < np.array(shares)[:, None]).astype(np.float64)
+        else:
+            right = rng.binomial(
+                answers, [beta.ppf(rank, 5 * share, 5 * (1 - share)) for rank, share in zip(ranks, shares, strict=True)]
+            )
+        sums = [{(0, f"s{n}"): np.array([count, answers]) for n, count in enumerate(counts)} for counts in right]
+        pair = pairing.pair(measure, sums[0], sums[1])
+        assert pair is not None
+        gain = pairing.gain(measure, [pair])
+        differences = 100 * (right[0] - right[1]) / answers
+        half_width = student.ppf(0.975, clusters - 1) * differences.std(ddof=1) / np.sqrt(clusters)
+        found[repeat] = (
+            gain.low <= truth <= gain.high,
+            gain.high - gain.low,
+            abs(differences.mean() - truth) <= half_width,
+        )
+    return ShareCoverage(*(float(mean) for mean in found.mean(axis=0)))
 
 
 def lines(repeats: int = REPEATS) -> Iterator[str]:
@@ -322,8 +368,17 @@ def lines(repeats: int = REPEATS) -> Iterator[str]:
         cell = "no interval" if np.isnan(by_material) else f"{by_material:.3f}"
         yield f"| {materials} | {same:.3f} | {slides:.3f} | {cell} |"
     yield ""
-    yield "| objects | area under the curve | percentile bootstrap | coverage | of the margin over a baseline |"
-    yield "| --- | --- | --- | --- | --- |"
+    yield "| clusters | answers each | right: model, baseline | coverage | mean width (points) | jackknife alone |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for answers in ANSWERS:
+        for clusters in (6, 10, 18, 40, 100):
+            for pair in SHARES:
+                coverage, width, jackknife = share_coverage(clusters, pair, answers, repeats)
+                shares_text = f"{pair[0]:g}, {pair[1]:g}"
+                yield f"| {clusters} | {answers} | {shares_text} | {coverage:.3f} | {width:.1f} | {jackknife:.3f} |"
+    yield ""
+    yield "| objects | area under the curve | coverage | of the margin over a baseline |"
+    yield "| --- | --- | --- | --- |"
     for objects in (6, 10, 26, 41):
         for area in (0.55, 0.72, 0.86, 0.97):
             shares = area_coverage(objects, area, repeats)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.metrics import intervals
+from tacpipe.scores import intervals
 
 ROOT = Path(__file__).parents[1]
 WORK = ROOT / ".cache" / "learning-curve"

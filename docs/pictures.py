@@ -83,7 +83,7 @@ def first_screen(page: Path) -> None:
         from PIL import Image
 
         with Image.open(screenshot) as image:
-            image.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(IMAGES / "report.png", optimize=True)
+            image.convert("P", palette=Image.Palette.ADAPTIVE, colors=160).save(IMAGES / "report.png", optimize=True)
 
 
 def main() -> None:

@@ -45,12 +45,10 @@ def table(comparisons: Sequence[Comparison]) -> str:
     """Return the main results of one task as CSV.
 
     The table of ``forward`` has all models and the best baselines. The tables of the other tasks have, for each sensor or
-    each target of the thumb, the best model, the paper's network and the best baseline, and one row for chance.
+    each target, the best model, the paper's network and the best baseline, and one row for chance.
     """
     task = comparisons[0].task
     first = [comparison for comparison in comparisons if comparison.question.place == 0]
-    if task == "touch":  # the finger of the paper's tables
-        first = [comparison for comparison in first if comparison.question.target.endswith("thumb")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["method", *HEADS[task], "low", "high", first[0].measure.cluster])
@@ -65,7 +63,7 @@ def table(comparisons: Sequence[Comparison]) -> str:
         materials = len(first[0].rows[0].method.details[0].config["classes"])
         writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, count])
     if task == "touch":
-        writer.writerow(["constant", "both", 0, 0, 0, count])
+        writer.writerow(["constant", "all", 0, 0, 0, count])
     return text.getvalue()
 
 
@@ -94,17 +92,10 @@ def main_entries(comparison: Comparison) -> list[Entry]:
 
 
 def entry(name: str, row: ComparisonRow, comparison: Comparison) -> Entry:
-    """Return a row of the table: skill over the constant for touch, otherwise the score of the task.
-
-    The interval of an accuracy is Wilson's, as in `tacpipe evaluate`, so it never exceeds 100 %.
-    """
+    """Return a row of the table: skill over the constant for touch, otherwise the score of the task."""
     from tacpipe.comparison import engine
-    from tacpipe.metrics.intervals import wilson
 
     value: Any = row.score
-    if comparison.task == "material":
-        low, high = wilson(round(value.mean / 100 * row.recordings), row.recordings)
-        return name, (value.mean, 100 * low, 100 * high), row.recordings
     if comparison.task == "touch":
         source = next((other.method for other in comparison.rows if other.predictor == CONSTANT), row.method)
         value = engine.difference(row.method, source, comparison.question, (row.predictor, CONSTANT))

@@ -18,6 +18,7 @@ import numpy as np
 import tacpipe
 from tacpipe.arrays import Floats, Times
 from tacpipe.datasets.dataset import Recording
+from tacpipe.tasks.learning.features import ChannelAxes
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
 from tacpipe.tasks.slip.evaluation import MODEL, EvaluatedSlips
@@ -149,7 +150,7 @@ def draw(path: Path, data: Path, models: Sequence[Path], results: Sequence[Path]
         recording, model = recordings[name], tacpipe.load(models[fold])
         event_ns, truth_ns, used = friction_in_use(recording)
         table, track = model.predict(recording), model.reader.track(recording)
-        touch, places = track.fingers[0], model.reader.fingers[0].places
+        touch, places = track.streams[0], ChannelAxes.from_layout(model.reader.streams[0].layout)
         x, y = (touch.values[:, axis].mean(axis=1) for axis in places.shear)
         upper, middle, lower = grid[:, column]
         upper.plot((truth_ns - event_ns) / 1e9, used, color=BLUE, linewidth=1)

@@ -18,15 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import tacpipe
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics.calibration import COVERAGE_FILE, Band
 from tacpipe.plugins import given_params, registry
+from tacpipe.scores.calibration import COVERAGE_FILE, Band, measure_bands
 from tacpipe.tasks.task import CalibrationRequest
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import model as touch_model
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
-from tacpipe.tasks.touch.report import measure_bands
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +86,7 @@ def table(rows: pd.DataFrame) -> str:
     lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for known in (True, False):
         values = rows[rows.known == known]
-        bands = measure_bands(values, known)
+        bands = measure_bands(values, "target", "recording" if known else "object", CONSTANT)
         for target in (name for name in headlines.TARGETS if (name, MODEL) in bands):
             model, constant, mean = (bands[target, name] for name in (MODEL, CONSTANT, OBJECT_MEAN))
             cells = ["known" if known else "novel", f"`{target}`", str(values.recording.nunique())]

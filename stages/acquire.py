@@ -12,8 +12,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.datasets import directory
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
+from tacpipe.io.termination import EndRequest
+from tacpipe.recording import clock
 
 if TYPE_CHECKING:
     from tacpipe.recording.rig import Rig
@@ -29,8 +32,6 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
 
     Raises `UsageError` for invalid options, and `DeviceError` if streams do not open or send nothing.
     """
-    from tacpipe.datasets import directory
-    from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, trials, triggers
     from tacpipe.recording.pictures import serve_pictures
     from tacpipe.recording.recorder import Recorder, complete_rig
@@ -93,8 +94,6 @@ def measure(rig: Rig) -> dict[str, Figures]:
 
     Raises `DeviceError` if streams do not open or send nothing.
     """
-    from tacpipe.io.termination import EndRequest
-    from tacpipe.recording import clock
     from tacpipe.recording.recorder import Recorder
 
     recorder = Recorder(rig)

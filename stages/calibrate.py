@@ -41,9 +41,9 @@ class Params:
 def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None) -> Result:
     """Return the files of the model with its uncertainty."""
     from tacpipe.datasets import model_files
-    from tacpipe.tasks.task import CalibrationRequest
+    from tacpipe.tasks.task import CalibrationRequest, task_of_model
 
-    task = model_files.task(model.files)
+    task = task_of_model(model.files)
     task_calibration = task.calibration
     if task_calibration is None:
         raise UsageError(f"Models of the task {task.name} cannot be calibrated. Give a model of another task.")

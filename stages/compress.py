@@ -106,8 +106,8 @@ def fit_autoencoder(params: AutoencoderParams, train: Dataset, workspace: Worksp
     return Result(files=codec.to_files(), notes=notes)
 
 
-@stage(version=2, fit=fit)
-def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
+@stage(version=2)
+def pca(params: Params, recording: Recording, codec: Annotated[Fitted, fit]) -> pa.Table:
     """Compress tactile channels with principal components.
 
     The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. A recording must have the
@@ -120,8 +120,8 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
     return tactile.add_latents(recording, codec)
 
 
-@stage(version=1, fit=fit_autoencoder)
-def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) -> pa.Table:
+@stage(version=1)
+def autoencoder(params: AutoencoderParams, recording: Recording, codec: Annotated[Fitted, fit_autoencoder]) -> pa.Table:
     """Compress tactile channels with an autoencoder.
 
     The latents are added as columns ``z00``, ``z01``, …; all other columns and rows stay. 15 % of the training

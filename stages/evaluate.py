@@ -16,12 +16,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import UsageError
-from tacpipe.metrics import headline
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import Result, stage
+from tacpipe.plugins.stage import Result, Values, stage
+from tacpipe.scores import headline
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -38,16 +38,18 @@ class Params:
     live: bool = added(False)
 
 
-def _is_live(params: Params) -> bool:
-    return params.live
+def prepare(params: Params) -> dict[str, Values] | None:
+    """Return no stage for recordings of live sessions, which are evaluated as they were recorded, else the model's."""
+    return {} if params.live else None
 
 
-@stage(version=8, headline=headline.FILE, as_given=_is_live)
-def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
+@stage(version=9, headline=headline.FILE)
+def evaluate(params: Params, model: Model, recordings: Annotated[Dataset, prepare]) -> Result:
     """Evaluate a model on recordings with the metrics of its task."""
     from tacpipe.datasets import model_files
+    from tacpipe.tasks.task import task_of_model
 
-    task = model_files.task(model.files)
+    task = task_of_model(model.files)
     if params.live:
         result = _evaluate_sessions(task, model, recordings)
     else:

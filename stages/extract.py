@@ -18,7 +18,7 @@ import numpy as np
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import file_digest
 from tacpipe.plugins import registry
-from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Seed, Unit
+from tacpipe.plugins.constraints import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seed, Unit
 from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.plugins.stage import Fitted, RecordingOutput, Result, Workspace, stage
 from tacpipe.plugins.stream_selection import StreamSelection
@@ -45,7 +45,8 @@ class Params(StreamSelection):
 
     rows: PositiveInt = 6  # rows of the grid
     columns: PositiveInt = 8  # columns of the grid
-    reference_frames: PositiveInt = 5  # number of first frames whose mean is the untouched gel
+    # number of first frames whose mean is the untouched gel; 0: brightness itself, for recordings of single images
+    reference_frames: NonNegativeInt = 5
 
     def check(self) -> None:
         """Raise `UsageError` for a grid with more cells than a table should have columns."""
@@ -160,8 +161,10 @@ def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: W
     return Result(files={frame_autoencoder.WEIGHTS: weights})
 
 
-@stage(version=2, fit=fit_autoencoder)
-def autoencoder(params: FrameAutoencoderParams, recording: Recording, codec: Fitted) -> RecordingOutput:
+@stage(version=2)
+def autoencoder(
+    params: FrameAutoencoderParams, recording: Recording, codec: Annotated[Fitted, fit_autoencoder]
+) -> RecordingOutput:
     """Encode frames with a small convolutional autoencoder.
 
     Each stream of frames becomes a stream of features with a row per frame. The network is trained on frames of the

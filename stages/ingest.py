@@ -10,25 +10,21 @@ Example: tacpipe ingest mcap FOLDER -o data/recordings
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 from tacpipe.errors import UsageError
-from tacpipe.formats.table import contained
-from tacpipe.formats.table import layout as layouts
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.plugins.constraints import TomlFile
-from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values, stage
+from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Values, stage
 from tacpipe.plugins.video_checks import VideoChecks, check_videos
 
-ROSBAG, MCAP, HDF5 = ContainerCommand("rosbag"), ContainerCommand("mcap"), ContainerCommand("hdf5")
-XDF, LEROBOT, ZARR = ContainerCommand("xdf"), ContainerCommand("lerobot"), ContainerCommand("zarr")
+ROSBAG, MCAP, HDF5 = LayoutCommand("rosbag"), LayoutCommand("mcap"), LayoutCommand("hdf5")
+XDF, LEROBOT, ZARR, TABLE = LayoutCommand("xdf"), LayoutCommand("lerobot"), LayoutCommand("zarr"), LayoutCommand(None)
 
 
-@ROSBAG.stage(version=4)
+@stage(version=4, source=ROSBAG.discovery)
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
@@ -40,7 +36,7 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     return ROSBAG.read(params, files, values)
 
 
-@MCAP.stage(version=4)
+@stage(version=4, source=MCAP.discovery)
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read MCAP files (ROS, JSON or protobuf messages).
 
@@ -52,7 +48,7 @@ def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     return MCAP.read(params, files, values)
 
 
-@HDF5.stage(version=4)
+@stage(version=4, source=HDF5.discovery)
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 
@@ -65,7 +61,7 @@ def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     return HDF5.read(params, files, values)
 
 
-@XDF.stage(version=2)
+@stage(version=2, source=XDF.discovery)
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 
@@ -81,14 +77,12 @@ def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
 class LeRobotParams(VideoChecks, Params):
     """Settings that datasets do not state."""
 
-
-def preview_lerobot(params: LeRobotParams, source: Path) -> str:
-    """Describe the streams that would be read from LeRobot datasets."""
-    with check_videos(params):
-        return LEROBOT.preview(params, source)
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context in which videos are checked as these settings state."""
+        return check_videos(self)
 
 
-@LEROBOT.stage(version=4, preview=preview_lerobot)
+@stage(version=4, source=LEROBOT.discovery)
 def lerobot(params: LeRobotParams, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
 
@@ -97,8 +91,7 @@ def lerobot(params: LeRobotParams, files: Files, values: Values) -> RecordingOut
 
     Example: tacpipe ingest lerobot datasets/pusht -o data/recordings
     """
-    with check_videos(params):
-        return LEROBOT.read(params, files, values)
+    return LEROBOT.read(params, files, values)
 
 
 @dataclass(frozen=True)
@@ -107,16 +100,14 @@ class ZarrParams(Params):
 
     fill_missing_chunks: bool = False  # read missing chunks as fill values, which zarr 3 does not write
 
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context in which missing chunks are read as these settings state."""
+        from tacpipe.formats.arrays.zarr import allow_missing_chunks
 
-def preview_zarr(params: ZarrParams, source: Path) -> str:
-    """Describe the streams that would be read from Zarr stores."""
-    from tacpipe.formats.arrays.zarr import allow_missing_chunks
-
-    with allow_missing_chunks(filled=params.fill_missing_chunks):
-        return ZARR.preview(params, source)
+        return allow_missing_chunks(filled=self.fill_missing_chunks)
 
 
-@ZARR.stage(version=4, preview=preview_zarr)
+@stage(version=4, source=ZARR.discovery)
 def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
     """Read Zarr stores, such as replay buffers of UMI.
 
@@ -126,10 +117,7 @@ def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
 
     Example: tacpipe ingest zarr replay.zarr.zip --layout layout.toml -o data/recordings
     """
-    from tacpipe.formats.arrays.zarr import allow_missing_chunks
-
-    with allow_missing_chunks(filled=params.fill_missing_chunks):
-        return ZARR.read(params, files, values)
+    return ZARR.read(params, files, values)
 
 
 @dataclass(frozen=True)
@@ -140,44 +128,16 @@ class TableParams(VideoChecks):
 
     def check(self) -> None:
         """Raise `UsageError` for a missing or invalid layout, before files are searched."""
-        self.parsed()
-
-    def parsed(self) -> layouts.Layout:
-        """Return the layout."""
         if not self.layout:
             raise UsageError("--layout must be given: the file that describes the tables. --guess prints a first one.")
-        return layouts.layout_from_tables(json.loads(self.layout), "The layout")
+        TABLE.parsed(self)
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context in which videos are checked as these settings state."""
+        return check_videos(self)
 
 
-def discover_table(params: TableParams, source: Path) -> dict[str, Source]:
-    """Return the files and labels of each recording in ``source``."""
-    from tacpipe.formats.table import recordings
-
-    layout = params.parsed()
-    return contained.discover_sources(layout, source, recordings.find_recordings(layout, source))
-
-
-def preview_table(params: TableParams, source: Path) -> str:
-    """Describe in words what would be read."""
-    from tacpipe.formats.table import recordings
-
-    layout = params.parsed()
-    return contained.preview_text(layout, source, recordings.find_recordings(layout, source))
-
-
-def guess_table(source: Path) -> str:
-    """Return the text of a guessed layout."""
-    from tacpipe.formats.table import guess
-
-    return guess.guess_layout(source)
-
-
-def why_unread_table(params: TableParams, source: Path) -> Callable[[str], str]:
-    """Return a function from the path of a file in ``source`` to the reason why it is not read."""
-    return contained.why_unread(params.parsed(), source)
-
-
-@stage(version=2, discover=discover_table, preview=preview_table, guess=guess_table, why_unread=why_unread_table)
+@stage(version=2, source=TABLE.discovery)
 def table(params: TableParams, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
     """Read a lab's own tables (CSV, Excel, Parquet, NumPy).
 
@@ -186,5 +146,4 @@ def table(params: TableParams, files: Files, values: Values, shared: Shared | No
 
     Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
     """
-    with check_videos(params):
-        return contained.read_recording(params.parsed(), None, files, values, shared)
+    return TABLE.read(params, files, values, shared)

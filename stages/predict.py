@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import CommaList, PositiveInt
 from tacpipe.plugins.params import added
-from tacpipe.plugins.stage import Result, stage
-from tacpipe.tasks.task import PredictionRequest, Task
+from tacpipe.plugins.stage import Result, Values, stage
+from tacpipe.tasks.task import PredictionRequest, Task, task_of_model
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
@@ -41,18 +41,19 @@ class Params:
     probabilities: bool = added(False)
 
 
-def _is_causal(params: Params) -> bool:
-    return params.causal
+def prepare(params: Params) -> dict[str, Values] | None:
+    """Return no stage for causal predictions, which begin with recordings as they were recorded, else the model's."""
+    return {} if params.causal else None
 
 
-@stage(version=1, as_given=_is_causal)
-def predict(params: Params, model: Model, recordings: Dataset) -> Result:
+@stage(version=1)
+def predict(params: Params, model: Model, recordings: Annotated[Dataset, prepare]) -> Result:
     """Return each recording's predictions, with the time at which each was available."""
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))
     quantiles = sorted(set(CommaList(PositiveInt).items(params.quantiles)))
-    task = model_files.task(model.files)
+    task = task_of_model(model.files)
     request = PredictionRequest(steps, quantiles, params.probabilities, params.allow_look_ahead)
     if params.causal:
         return _predict_causally(task, model, recordings, request)

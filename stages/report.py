@@ -1,8 +1,8 @@
 """Show results on one self-contained HTML page.
 
 Each task has a section: the best method and its gain, a chart and a table, then details in collapsible sections.
-Results of the same task are compared, with seeds and folds of a method pooled. Outputs of ``tacpipe compress``, slides
-and grasps are drawn next to results of a task that uses them.
+Results of the same task are compared, with seeds and folds of a method pooled. Frames of recordings with cameras are
+shown next to results of a task that names them right or wrong.
 
 Example: tacpipe report results/forward -o report.html
 """
@@ -29,10 +29,10 @@ class Params:
     """Contents of the page."""
 
     title: str = ""  # heading of the page; empty: what its tasks predict
-    traces: NonNegativeInt = 2  # number of recordings whose predictions are drawn, for each forecast shown in full
+    traces: NonNegativeInt = 2  # number of recordings whose forecasts are drawn
 
 
-@stage(version=13)
+@stage(version=14)
 def report(params: Params, results: Datasets, rows: Rows) -> Result:
     """Return a page with the answer, charts, tables, and the source of every number."""
     from tacpipe.report import page

@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from tacpipe.channels.schema import is_truth
 from tacpipe.channels.streams import AT_ARRIVAL, COUNT, common_unit, count_axes, missing_channel_error
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
@@ -250,7 +251,7 @@ def _tactile_columns(name: str, schema: pa.Schema) -> dict[str, list[str]]:
     columns_by_stream: dict[str, list[str]] = {}
     for field in schema:
         metadata = field.metadata or {}
-        if metadata.get(b"quantity") == b"tactile":
+        if metadata.get(b"quantity") == b"tactile" and not is_truth(field):
             columns_by_stream.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
     if not columns_by_stream:
         raise missing_channel_error(name, "tactile", schema)

@@ -64,6 +64,7 @@ class Params:
     # jolt: moves until it slips; jolt-held: nearly slips; fade: the grip weakens until it slips; fade-held: nearly slips;
     # release: the gripper opens on purpose; shake, hold: no event; mixed: all; planned: none of these
     handling: Handling = added("planned")
+    same_skins: bool = added(False)  # all trials have the same two tactile sensors, as on one rig
 
     def check(self) -> None:
         """Raise an error for a handling next to params that it replaces."""

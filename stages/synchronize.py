@@ -4,7 +4,8 @@ The output has one table for each recording, with masks of repeated samples and 
 one stream, the master, at the time when it was measured, from when all streams have started. A row contains the newest
 sample of every other stream that had arrived by then, as in a live session: no row looks ahead. With ``--rate-hz`` rows
 are at a constant rate. --values interpolate is for offline analysis: its rows look ahead, and live sessions refuse a
-model that was trained on them.
+model that was trained on them. Columns to learn, such as a measured force, are ``--truth``: they are interpolated at the
+times of the rows, and no stage takes them as input.
 
 Example: tacpipe synchronize data/recordings -o data/synced
 """
@@ -19,7 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tacpipe.channels import streams as masks
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
-from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
+from tacpipe.plugins.constraints import Names, PositiveFloat, Rate, Unit
+from tacpipe.plugins.params import added
 from tacpipe.plugins.rows import LATE, OUTSIDE, UNNEEDED, RowCounts
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Values, stage
 from tacpipe.plugins.stream_selection import StreamSelection
@@ -52,6 +54,8 @@ class Params(StreamSelection):
     # time of a sample with --values interpolate: arrival; device: its own stamp; auto: device if there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of 16-bit tactile counts; other channels do not change
+    # columns of the result to learn, with * as wildcard, as 'ft_*': interpolated in time, and no input of any stage
+    truth: Names = added("")
 
     def check(self) -> None:
         """Raise an error for two grids, and for held values on device clocks, whose fit reads the whole recording."""
@@ -101,6 +105,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     from tacpipe.signals.resampling import default_gap_ns, median_step_ns
     from tacpipe.synchronization import streams
     from tacpipe.synchronization.columns import GridColumns, grid_ranges
+    from tacpipe.synchronization.truth import TruthColumns, truth_columns, without_truth
 
     recorded_streams = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     signal_streams = {
@@ -114,9 +119,11 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     }
     master_name = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in signal_streams.items()}
-    master = placed_streams[streams.master(recording.name, master_name, schemas)]
+    truth_names = truth_columns(schemas, params.truth, recording.name)
+    inputs = without_truth(placed_streams, truth_names, master_name, recording.name)
+    master = inputs[streams.master(recording.name, master_name, {name: inputs[name].schema for name in inputs})]
     grid = streams.find_rows(
-        recording.name, params.timeline, params.rate_hz, placed_streams, master, storage, hold_values=hold_values
+        recording.name, params.timeline, params.rate_hz, inputs, master, storage, hold_values=hold_values
     )
     grid_ns = grid.t_ns
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
@@ -129,7 +136,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     ahead_ns[:] = 0
     gaps: dict[str, pa.Array] = {}  # masks (grid,) by name
     readers: list[GridColumns] = []
-    for name, stream in placed_streams.items():
+    for name, stream in inputs.items():
         exact = None if hold_values else streams.rows_at(stream.t_ns, grid_ns, storage)
         if params.unwrap:
             stream = streams.unwrap_counts(stream)
@@ -145,11 +152,17 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
             attributes[f"{name}_fresh_hz"] = round(new_frame_rate_hz(stream.t_ns, stream.repeated), 3)
             attributes |= stream.attributes
         storage.release()
+    truths = {
+        name: TruthColumns(placed_streams[name], names, grid_ns, params.gap_ms, storage, unwrap=params.unwrap)
+        for name, names in truth_names.items()
+    }
+    attributes |= {f"{name}{masks.WITHOUT_TRUTH}": truth.missing_rows for name, truth in truths.items()}
     at_arrival = storage.empty((len(grid_ns),), bool)
     at_arrival[:] = master.at_arrival[grid.numbers] if params.rate_hz is None else False
     attributes[masks.LOOK_AHEAD_MEAN] = round(float(ahead_ns.mean()) / 1e6, 3) if len(ahead_ns) else 0.0
     attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max(initial=0)) / 1e6, 3)
     notes = [*masks.describe_gaps(pa.Table.from_pydict(gaps)), *_time_notes(master, at_arrival, placed_streams)]
+    notes += [note for truth in truths.values() for note in truth.notes()]
     fields = masks.row_fields(master.columns.schema.field("t_ns"), held=hold_values)
 
     def batches() -> Iterator[pa.RecordBatch]:
@@ -157,6 +170,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
             arrivals = [grid.arrival_ns[points], at_arrival[points]] if hold_values else []
             columns = list(zip(fields, [grid_ns[points], *arrivals], strict=True))
             columns += [column for reader in readers for column in reader.read(points)]
+            columns += [column for truth in truths.values() for column in truth.read(points)]
             arrays = [to_arrow(values, kind.type) if hasattr(values, "dtype") else values for kind, values in columns]
             yield pa.RecordBatch.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
             storage.release()
@@ -169,7 +183,8 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     rows_by_stream = {
         name: RowCounts.some_used(columns.num_rows, 0, UNNEEDED) for name, columns in recorded_streams.items()
     }
-    for (name, stream), reader in zip(placed_streams.items(), readers, strict=True):
+    rows_by_stream |= {name: truth.row_counts() for name, truth in truths.items()}
+    for (name, stream), reader in zip(inputs.items(), readers, strict=True):
         used = reader.used_samples()
         unused = {OUTSIDE: len(stream.t_ns) - used, LATE: stream.late}
         rows_by_stream[name] = RowCounts(len(stream.t_ns) + stream.late, used, unused)

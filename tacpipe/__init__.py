@@ -186,11 +186,11 @@ def load(path: str | PathLike[str]) -> Any:
 
     :raises UsageError: if ``path`` is not a model.
     """
-    from tacpipe.datasets import model_files
     from tacpipe.plugins import extras
+    from tacpipe.tasks.task import task_of_model
 
     model = open(path)
     with extras.explain_missing("A model"):
         from tacpipe.tasks.recordings import OpenedChain
 
-        return model_files.task(model.files, str(path)).load(model.files, OpenedChain(model))
+        return task_of_model(model.files, str(path)).load(model.files, OpenedChain(model))

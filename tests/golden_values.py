@@ -19,6 +19,7 @@ COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
     "synchronize": "synchronize simulate.forward --rate-hz 50 --values interpolate -o {0}",
     "segment.contacts": "segment contacts synchronize -o {0}",
+    "segment.blocks": "segment blocks segment.contacts --parts 3 -o {0}",
     "segment.slips": "segment slips segment.contacts -o {0}",
     "simulate.material": "simulate material --trials 12 --materials 3 --seed 7 -o {0}",
     "segment.slides": "segment slides simulate.material -o {0}",

@@ -371,6 +371,21 @@ def test_windows_go_through_a_loader_in_worker_processes_and_read_nothing_before
     assert torch.cat([batch["t_ns"] for batch in batches]).shape == (40, 3)
 
 
+@pytest.mark.parametrize("kept_bytes", [1 << 30, 100])
+def test_several_windows_at_once_are_those_one_by_one_in_memory_and_in_a_file(
+    four: Dataset, kept_bytes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = [four.windows(2, 1, inputs=["arm_*"], scale=True)[index] for index in (3, 39, -1, 3, 20)]
+    monkeypatch.setattr("tacpipe.datasets.windows.KEPT_BYTES", kept_bytes)
+    windows = four.windows(2, 1, inputs=["arm_*"], scale=True)
+    for window, one in zip(windows.__getitems__([3, 39, -1, 3, 20]), expected, strict=True):
+        assert window["recording"] == one["recording"]
+        for name in ("past", "future", "t_ns"):
+            assert torch.equal(window[name], one[name])
+    with pytest.raises(IndexError, match="none has the index 40"):
+        windows.__getitems__([0, 40])
+
+
 def test_windows_separate_inputs_and_targets_by_names_and_patterns(four: Dataset) -> None:
     windows = four.windows(2, 1, inputs=["arm_*", "left_?"], targets=["left_x"])
     assert (windows.inputs, windows.targets) == (("arm_force_n", "left_x"), ("left_x",))

@@ -2,14 +2,16 @@
 
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tacpipe.maintenance import garbage, repair
+from tacpipe.maintenance import status as statuses
 from tacpipe.store import layout
+from tacpipe.store.backend import Entry
 from tacpipe.store.store import Store
 from tests.conftest import Lab
 from tests.test_garbage import age
@@ -133,9 +135,9 @@ def test_a_status_beside_a_collection_counts_what_it_still_finds(
                 removed[-1].unlink()
             yield place, folders, files
 
-    before = repair.status(store)
+    before = statuses.status(store)
     monkeypatch.setattr(os, "walk", walk)
-    status = repair.status(store)
+    status = statuses.status(store)
     assert draft in removed and len(removed) == 2
     assert status["tmp"]["files"] == 0 < status["objects"]["files"] < before["objects"]["files"]
 
@@ -144,15 +146,12 @@ def test_a_dry_run_beside_a_collection_counts_what_it_still_finds(
     littered: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = littered.store
-    honest = garbage._young
+    honest = store.entries
     collections: list[garbage.Collected] = []
 
-    def young(path: str) -> bool:
-        if not collections and "/objects/" in path:
-            monkeypatch.setattr(garbage, "_young", honest)
-            collections.append(garbage.collect(Store(store.root), dry_run=False))
-            return False
-        return honest(path)
+    def entries(names: Iterable[str]) -> dict[str, Entry]:
+        collections.append(garbage.collect(Store(store.root), dry_run=False))
+        return honest(names)
 
-    monkeypatch.setattr(garbage, "_young", young)
+    monkeypatch.setattr(store, "entries", entries)
     assert garbage.collect(store, dry_run=True).objects == 0 < collections[0].objects

@@ -11,8 +11,8 @@ from sklearn.linear_model import QuantileRegressor
 from sklearn.metrics import log_loss, mean_pinball_loss, roc_auc_score
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import calibration
-from tacpipe.metrics.calibration import conformal_quantile, highest_promised_level
+from tacpipe.scores import calibration
+from tacpipe.scores.calibration import conformal_quantile, highest_promised_level
 from tacpipe.tasks.forward.quantiles import ResidualQuantiles
 
 SCORES = st.lists(st.integers(-5, 5), min_size=1, max_size=30)

@@ -34,6 +34,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
             "quickstart",
             "tutorials/simulated",
             "tutorials/compare",
+            "tutorials/newtons",
             "tutorials/own-data",
             "howto/hdf5",
             "howto/view",
@@ -369,18 +370,17 @@ def test_the_tables_of_results_are_made_from_results() -> None:
     text = module("result_pages").table(engine.compare([result("trees", off=0.02), short]))
     rows = list(csv.DictReader(io.StringIO(text)))
     assert list(rows[0]) == ["method", "target", "skill", "low", "high", "grasps"]
+    targets = ("PDC thumb", "PDC middle finger", "electrodes thumb", "electrodes middle finger")
+    methods = (("trees on geometry and colour", "0.800"), ("PointNet (paper's network, 15 of 250 epochs)", "0.500"))
     assert [(row["method"], row["target"], row["skill"]) for row in rows] == [
-        ("trees on geometry and colour", "PDC thumb", "0.800"),
-        ("PointNet (paper's network, 15 of 250 epochs)", "PDC thumb", "0.500"),
-        ("trees on geometry and colour", "electrodes thumb", "0.800"),
-        ("PointNet (paper's network, 15 of 250 epochs)", "electrodes thumb", "0.500"),
-        ("constant", "both", "0"),
+        *((method, target, skill) for target in targets for method, skill in methods),
+        ("constant", "all", "0"),
     ]
 
 
 def test_the_table_of_materials_states_shares_of_slides_with_wilson_s_interval() -> None:
     from tacpipe.comparison import engine
-    from tacpipe.metrics.intervals import wilson
+    from tacpipe.scores.intervals import wilson
     from tests.tasks.material.report import material_fakes
 
     results = [
@@ -403,7 +403,6 @@ PARSED = {  # beginnings of examples of the help that are parsed and not run, an
     "demo": "runs for minutes, and the examples here do the same",
     "extract": "needs the recording of a camera; tests/stages/test_extract.py has such recordings",
     "ingest": "needs files of other programs; tests/formats reads such files",
-    "limits": "runs for minutes",
     "live": "needs the devices of a rig",
     "sensors emulate": "runs until Ctrl-C",
     "sensors probe": "needs a device",
@@ -420,12 +419,13 @@ PREPARED = {  # commands that must run before the example of a command
         "synchronize data/recordings -o data/even --rate-hz 50",
         "segment contacts data/even -o data/even-contacts",
     ),
+    "train classify": ("split data/grasps -o data/grasps-split --stratify object",),
     "train material": ("split data/slides -o data/slides-split --stratify sensor,material",),
-    "train touch": ("split data/grasps -o data/grasps-split --stratify object",),
     "compare": ("evaluate models/forward data/segments --split data/split -o results/forward-gru",),
 }
 SHORT = """
-train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10}}
+train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10},
+  regress: {stride: 20}, classify: {stride: 20}}
 compress: {autoencoder: {epochs: 1, search: 0}}
 """
 CHAIN = "stages: {train: {cmd: tacpipe version}, evaluate: {cmd: tacpipe version}, forward: {cmd: tacpipe version}}"
@@ -469,7 +469,7 @@ def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> Non
 
 WIDTH = 76  # characters of a command line that fit a block of code on the site
 QUESTIONS = {  # Questions of users, each with the page and the heading of the answer.
-    "How do I record two serial sensors?": ("tutorials/rig.md", "Your first rig: two serial sensors"),
+    "How do I record two sensors?": ("tutorials/rig.md", "Your first rig: two sensors"),
     "How do I read my CSV files?": ("tutorials/own-data.md", "Your own CSV files"),
     "What does synchronize do to timestamps?": ("explanation/recording.md", "Two clocks"),
     "Which forward model is best?": ("howto/choose-model.md", "Choose a model"),
@@ -663,3 +663,8 @@ def test_make_says_in_one_sentence_that_python_is_missing(tmp_path: Path) -> Non
     assert process.returncode != 0
     assert "Python 3.11 or newer is missing" in process.stderr
     assert not (tmp_path / "venv").exists()
+
+
+def test_help_of_a_command_that_a_test_runs_is_the_page_s(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "102")
+    assert lab.run("show --help").out.strip() == hooks().help_of(["show"])

@@ -259,14 +259,12 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
     for text in (
         "5 folds",
         "5 folds, calibrated",
-        "Coverage of each electrode",
+        "Coverage of the 10 to 90 % band",
         "leave one object out",
         "later grasps",
-        "<td>XYZ</td>",
-        "<td>RGBCont</td>",
+        "inputs: ",
     ):
         assert text in page
-    assert "XYZCont" not in page  # The page has the rows of the paper that were run.
 
 
 @pytest.mark.long

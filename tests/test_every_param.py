@@ -35,6 +35,7 @@ Call = Callable[[str], Ran]
 STAGES = [name for name in registry.stages() if registry.load(name).function.__module__.startswith("tacpipe")]
 FREE = {  # params that are any text, and why
     "synchronize.master": "the name of a stream",
+    "synchronize.truth": "patterns of columns of recordings",
     "segment.slips.channel": "the name of a column",
     "split.stratify": "attributes of recordings, which are the lab's own",
     "split.few_by": "an attribute of recordings",
@@ -49,6 +50,17 @@ FREE = {  # params that are any text, and why
     "train.material.subsample_sensor": "a sensor of recordings",
     "train.material.frozen_sensor": "a sensor of recordings",
     "train.material.run_label": "words for a report",
+    "train.regress.target": "patterns of columns of recordings",
+    "train.classify.label": "a label, a column or a kind of intervals, which are the lab's own",
+    **{
+        f"train.{task}.{param}": reason
+        for task in ("regress", "classify")
+        for param, reason in (
+            ("inputs", "patterns of columns of recordings"),
+            ("recentre", "a label of recordings"),
+            ("group", "labels of recordings, which are the lab's own"),
+        )
+    },
     "train.slip.streams": "patterns of streams of recordings",
     "train.slip.forward_model": "the path of a model",
     "train.slip.forward_digest": "the digest of a model",
@@ -329,7 +341,7 @@ def test_the_options_of_a_command_know_their_panels(name: str) -> None:
     from tacpipe.cli import stages
 
     program = typer.Typer()
-    stages.add(program, name, "stage")
+    stages.add(program, name, "stage", [])
     panel_of_option = {
         param.name: getattr(param, "rich_help_panel", None) for param in typer.main.get_command(program).params
     }

@@ -55,13 +55,13 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "segment losses data/dropped-even -o {o}",
     "segment slides data/touched -o {o}",
     "segment grasps data/pinched -o {o}",
+    "segment blocks data/synced -o {o} --parts 2",
     "split data/segments -o {o} --scheme random",
     "label data/recordings trial-000 --set object=cup",
     "show data/synced",
     "show models/forward",
     "compare results/forward",
     "explain report.html",
-    "run dvc.yaml",
     "acquire --recover",
     "sensors list",
     "store status",
@@ -79,6 +79,8 @@ LACK = {  # Commands that need an extra, with that extra.
     "train forward data/segments --split data/split -o {o}": "learn",
     "train material data/slides --split data/slides-split -o {o}": "learn",
     "train slip data/even --split data/split -o {o}": "learn",
+    "train regress data/synced --split data/split -o {o} --target gt_force_z_n": "learn",
+    "train classify data/segments --split data/split -o {o} --label gt_slip": "learn",
     "track models/forward --to tensorboard:{o}": "tensorboard",
     "track models/forward --to mlflow:{o}": "mlflow",
     "track models/forward --to wandb:{o}": "wandb",
@@ -92,7 +94,6 @@ LACK = {  # Commands that need an extra, with that extra.
     "ingest hdf5 arrays --guess": "hdf5",
     "ingest zarr stores --layout rate.toml -o {o}": "zarr",
     "ingest zarr stores --layout rate.toml --dry-run": "zarr",
-    "limits data/grasps": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest gelsight-slip gels --rerun -o {o}": "video",
@@ -125,13 +126,11 @@ LACK = {  # Commands that need an extra, with that extra.
     "acquire can.toml -o {o}": "devices",
     "acquire camera.toml -o {o}": "clouds",
     "acquire lsl.toml -o {o}": "lsl",
-    "sensors emulate gel.toml -o {o} --duration-s 1": "video",
     "sensors probe lsl:wrist": "lsl",
     "sensors probe": "devices",
     "sensors probe /dev/null": "devices",
     "sensors probe hid:16c0:0486": "devices",
-    "sensors emulate ws.toml -o {o} --duration-s 1": "devices",
-    "sensors emulate can.toml -o {o} --duration-s 1": "devices",
+    "sensors emulate replayed.toml data/recordings -o {o} --duration-s 1": "devices",
 }
 PATIENCE_S = 300.0  # No command takes this long unless it hangs.
 HEADER = "ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -142,7 +141,6 @@ RIGS = {
     "can": ("icub-skin", "can:virtual:none"),
     "camera": ("clouds", "camera:0"),
     "lsl": ("lsl", "lsl:wrist"),
-    "gel": ("camera", "mjpeg:http://127.0.0.1:1/stream"),
 }
 INPUTS = (
     "simulate material --trials 2 -o data/touched",
@@ -197,6 +195,7 @@ def prepare(folder: Path) -> None:
     (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
+    (folder / "replayed.toml").write_text(stream("xela1", "xela", "ws:127.0.0.1:1"))
     run_all(
         folder,
         (

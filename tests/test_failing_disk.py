@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from tacpipe.datasets import manifest
 from tacpipe.datasets.paths import verified_copy
 from tacpipe.errors import FAILED, StorageError
 from tacpipe.maintenance import checkout, garbage, pushed, repair, unnamed
-from tacpipe.store import layout, location, projects, records
+from tacpipe.store import layout, location, projects
 from tacpipe.store.store import Store
 from tests.conftest import Lab, write_source
 from tests.test_garbage import age
@@ -160,7 +160,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "read_record": lambda: store.read_record(key),
         "record": lambda: store.record(key),
         "records": lambda: list(store.records()),
-        "records.naming": lambda: list(records.find_naming(store, name, 0)),
+        "records.naming": lambda: list(store.find_naming(name, 0)),
         "roots.all": lambda: store.roots.all(),
         "roots.get": lambda: store.roots.get(folder / "data/s"),
         "projects.known": lambda: projects.identity_of(store, folder),
@@ -233,3 +233,14 @@ def test_a_recording_whose_only_copy_cannot_be_read_is_not_called_lost(full: Lab
         ran = full.call("scale data/r -o data/other --factor 5 --jobs 1")
     assert met and ran.code == FAILED and os.strerror(number) in ran.err and "restore" not in ran.err
     full.run("scale data/r -o data/other --factor 5 --jobs 1")
+
+
+def test_a_verification_that_cannot_look_for_objects_says_so_and_goes_to_its_end(
+    full: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(store: Store, names: Iterable[str]) -> dict[str, int]:
+        raise StorageError("The disk failed.")
+
+    monkeypatch.setattr(Store, "sizes", fail)
+    ran = full.call("store verify")
+    assert ran.code == FAILED and "not read, and perhaps sound: objects: The disk failed." in ran.out

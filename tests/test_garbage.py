@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import tacpipe
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.maintenance import garbage, repair, sound_records
+from tacpipe.maintenance import garbage, repair
 from tacpipe.store.store import Store
 from tests.conftest import Lab, write_source
 from tests.test_pipeline import counts, replace_stream
@@ -310,14 +310,10 @@ def test_two_collections_do_not_run_at_once(lab: Lab) -> None:
     assert failed.code == 6
 
 
-def test_damage_to_a_record_is_found_however_often_it_was_sound_before(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tacpipe.maintenance.sound_records._FEWEST", 1)
+def test_damage_to_a_record_that_keeps_its_size_and_times_is_found(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
     assert repair.verify(lab.store).clean
-    assert (lab.store.root / "presence" / sound_records.NOTE).is_file()
     key = min(lab.store.names("records"))
     path = Path(lab.store.record_path(key))
     before, content = path.stat(), path.read_bytes()
@@ -325,26 +321,3 @@ def test_damage_to_a_record_is_found_however_often_it_was_sound_before(
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert path.stat().st_size == before.st_size
     assert repair.verify(lab.store).damaged == [key]
-
-
-def test_a_collection_removes_the_same_with_and_without_what_is_remembered_of_records(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lab.run("simulate toy -o data/r")
-    for factor in (2, 3, 5):
-        lab.run(f"scale data/r -o data/s --factor {factor}")
-    age(lab)
-    expected = collect_garbage(lab, "--dry-run")
-    monkeypatch.setattr("tacpipe.maintenance.sound_records._FEWEST", 1)
-    remembering = garbage.collect(lab.store, dry_run=True)
-    parsed: list[bytes] = []
-    monkeypatch.setattr(
-        "tacpipe.maintenance.sound_records.records.parse_record", lambda content, key: parsed.append(content)
-    )
-    remembered = garbage.collect(lab.store, dry_run=True)
-    assert vars(remembering) == vars(remembered) == vars(garbage.Collected()) | expected
-    assert not parsed
-    note = lab.store.root / "presence" / sound_records.NOTE
-    note.write_bytes(note.read_bytes().replace(b"\n", b"x\n", 3))
-    monkeypatch.undo()
-    assert vars(garbage.collect(lab.store, dry_run=True)) == vars(remembered)

@@ -6,8 +6,8 @@ import math
 import pytest
 
 from tacpipe.cli import headline_table
-from tacpipe.metrics import headline
-from tacpipe.metrics.headline import Headline, HeadlineRow
+from tacpipe.scores import headline, words
+from tacpipe.scores.headline import Headline, HeadlineRow
 
 ONE = Headline(
     "forward",
@@ -36,31 +36,31 @@ def headline_with(**changes: object) -> Headline:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "verdict", "words"),
+    ("low", "high", "verdict", "expected"),
     [
         (
             0.02,
             0.2,
             "better",
-            "is better than the baseline ridge, the best of 2 baselines: skill +0.100 (+0.020 to +0.200, ",
+            ", the best of 2 baselines, on 12 recordings: better (95 % interval: 2.0 to 20.0 % less).",
         ),
-        (-0.2, -0.1, "worse", "is worse than the baseline ridge"),
-        (-0.1, 0.2, "unclear", "does not differ measurably from the baseline ridge"),
-        (0.0, 0.2, "unclear", "does not differ measurably"),
+        (-0.2, -0.1, "worse", "worse (95 % interval: 20.0 to 10.0 % more)."),
+        (-0.1, 0.2, "unclear", "no measurable difference (95 % interval: 10.0 % more to 20.0 % less)."),
+        (0.0, 0.2, "unclear", "no measurable difference"),
     ],
 )
-def test_a_verdict_needs_an_interval_that_excludes_zero(low: float, high: float, verdict: str, words: str) -> None:
+def test_a_verdict_needs_an_interval_that_excludes_zero(low: float, high: float, verdict: str, expected: str) -> None:
     better_or_worse = headline_with(low=low, high=high)
     assert better_or_worse.verdict == verdict
-    assert headline.sentence(better_or_worse).startswith(f"Unseen objects: net {words}")
-    assert "95 % interval over 12 recordings" in headline.sentence(better_or_worse)
+    assert words.sentence(better_or_worse).startswith("Unseen objects: net has 10.0 % less error than ridge")
+    assert expected in words.sentence(better_or_worse)
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5])
 def test_few_recordings_give_no_verdict_whatever_their_interval(clusters: int) -> None:
     few_recordings = headline_with(clusters=clusters)
     assert few_recordings.verdict == ""
-    assert "too few for a verdict" in headline.sentence(few_recordings)
+    assert words.sentence(few_recordings).endswith("promising, not proven (6 recordings are needed).")
     assert headline_with(clusters=headline.MIN_CLUSTERS).verdict == "better"
 
 
@@ -68,18 +68,25 @@ def test_without_a_baseline_nothing_is_claimed() -> None:
     nan = float("nan")
     without_baseline = headline_with(baselines=(), gain=nan, low=nan, high=nan)
     assert without_baseline.verdict == "" and without_baseline.best is None
-    assert (
-        headline.sentence(without_baseline) == "Unseen objects: net was evaluated without a baseline, on 12 recordings."
-    )
+    assert words.sentence(without_baseline) == "Unseen objects: net was evaluated without a baseline, on 12 recordings."
 
 
-def test_several_are_better_together_only_where_each_is() -> None:
-    better, unclear, worse = headline_with(), headline_with(low=-0.1), headline_with(low=-0.2, high=-0.1)
-    assert headline.verdict([better, better]) == "better"
-    assert headline.verdict([worse, worse]) == "worse"
-    assert headline.verdict([better, unclear]) == headline.verdict([better, worse]) == "unclear"
-    assert headline.verdict([better, headline_with(clusters=2)]) == "unclear"
-    assert headline.verdict([]) == ""
+def test_more_than_three_headlines_are_counted_by_verdict_and_the_weakest_is_a_sentence() -> None:
+    worse = headline_with(part="known objects", gain=-0.1, low=-0.2, high=-0.05)
+    lines = words.summary([ONE, ONE, worse, headline_with(clusters=2)])
+    assert lines[0] == "4 comparisons with the best baseline: 2 better, 1 worse, 1 not proven. The weakest:"
+    assert lines[1:] == [words.sentence(worse)] and "has 10.0 % more error" in lines[1]
+    assert words.summary([ONE, worse]) == [words.sentence(ONE), words.sentence(worse)]
+
+
+def test_gains_in_points_and_areas_have_their_own_words() -> None:
+    points = headline_with(measure="points", gain=22.2, low=-2.1, high=43.5)
+    assert "net is right 22.2 points more often than ridge" in words.sentence(points)
+    assert "(95 % interval: 2.1 points less to 43.5 points more)" in words.sentence(points)
+    area = headline_with(measure="area", gain=-0.05, low=-0.1, high=-0.01)
+    assert "net has 0.050 less area than ridge" in words.sentence(area)
+    assert "worse (95 % interval: 0.100 to 0.010 less)" in words.sentence(area)
+    assert "net is right as often as ridge" in words.sentence(headline_with(measure="points", gain=0.0))
 
 
 def test_headlines_are_read_as_they_were_written() -> None:
@@ -92,14 +99,17 @@ def test_headlines_are_read_as_they_were_written() -> None:
 
 
 def test_the_table_has_the_model_above_its_best_baseline_and_how_the_interval_was_made() -> None:
-    lines = headline_table.text([ONE, headline_with(part="known objects", seeds=3)]).splitlines()
-    assert lines[0].split() == ["MAE", "t+1", "skill", "95", "%", "interval", "n"]
+    text = headline_table.text([ONE, headline_with(part="known objects", seeds=3)])
+    sentences, _, rest = text.partition("\n\n")
+    assert sentences.startswith("Unseen objects: net has") and "20.0 % less, 3 seeds)." in sentences
+    lines = rest.splitlines()
+    assert lines[0].split() == ["MAE", "t+1", "less", "error", "95", "%", "interval", "n"]
     assert lines[1] == "unseen objects"
-    assert lines[2].split() == ["net", "7.5", "+0.100", "+0.020", "to", "+0.200", "12"]
-    assert lines[3].split() == ["vs", "ridge", "8.25", "model", "is", "better"]
+    assert lines[2].split() == ["net", "7.5", "+10.0", "%", "+2.0", "to", "+20.0", "%", "12"]
+    assert lines[3].split() == ["than", "ridge", "8.25", "better"]
     assert lines[4] == "known objects"
     notes = " ".join(lines[7:])
-    assert "n: recordings. vs: the best of 2 baselines." in notes
+    assert "n: recordings. Than: the best of 2 baselines." in notes
     assert "1 − error / error of the best baseline; the error is the squared error" in notes
     assert "jackknife over recordings or recordings and seeds" in notes
     assert headline_table.text([]) == headline_table.EMPTY
@@ -111,8 +121,10 @@ def test_the_table_fits_the_width_and_keeps_the_error_that_ranks_and_the_interva
     wide = headline_with(
         columns=columns, model=rows[0], baselines=(rows[1],), method="taxelwise · raw", low=-0.068, high=0.025
     )
-    for width, expected_columns in ((120, columns), (80, ("MAE t+1", "vs persistence"))):
-        lines = headline_table.text([wide], width).splitlines()
+    heads = [*columns[:-1], "than persistence"]
+    for width, expected_heads in ((140, heads), (90, ("MAE t+1", "than persistence"))):
+        lines = headline_table.table([wide]).text(width).splitlines()
         assert max(map(len, lines)) <= width
-        assert [name for name in columns if name in lines[0]] == list(expected_columns)
-        assert "−0.068 to +0.025" in lines[2]
+        assert lines[0].split() == ["less", "error"]
+        assert [name for name in heads if name in lines[1]] == list(expected_heads)
+        assert "−6.8 to +2.5 %" in lines[3] and "38.0 %" in lines[3]

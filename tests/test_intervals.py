@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import intervals
-from tacpipe.metrics.intervals import mcnemar, paired_t, wilson
+from tacpipe.scores import intervals
+from tacpipe.scores.intervals import mcnemar, wilson
 
 RNG = np.random.default_rng(0)
 
@@ -142,30 +142,3 @@ def test_mcnemar_of_one_against_nine_is_22_of_1024() -> None:
 def test_answers_on_other_slides_are_not_compared() -> None:
     with pytest.raises(TacpipeError, match="same slides"):
         mcnemar(np.ones(3, bool), np.ones(4, bool))
-
-
-def test_paired_t_with_one_freedom_is_a_cauchy_distribution() -> None:
-    difference, t, p = paired_t([0.0, 0.0], [1.0, 3.0])
-    assert (difference, t) == pytest.approx((2.0, 2.0))  # mean 2, standard error sqrt(2) / sqrt(2)
-    assert p == pytest.approx(1 - 2 * math.atan(2.0) / math.pi)
-
-
-def test_paired_t_with_two_freedoms_has_a_closed_form() -> None:
-    _, t, p = paired_t([1.0, 2.0, 3.0], [2.0, 2.5, 4.5])
-    assert t == pytest.approx(1.0 / (0.5 / math.sqrt(3)))
-    assert p == pytest.approx(1 - t / math.sqrt(2 + t * t))
-
-
-def test_pairs_that_differ_alike_are_certain_and_equal_pairs_tell_nothing() -> None:
-    difference, t, p = paired_t([0.1, 0.2, 0.3], [0.0, 0.1, 0.2])
-    assert difference == pytest.approx(-0.1)
-    assert (t, p) == (-math.inf, 0.0)
-    difference, t, p = paired_t([0.7, 0.8], [0.7, 0.8])
-    assert difference == 0
-    assert math.isnan(t)
-    assert math.isnan(p)
-
-
-def test_one_pair_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="two or more pairs"):
-        paired_t([0.9], [0.8])

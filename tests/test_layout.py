@@ -313,16 +313,15 @@ def test_only_drafts_of_our_own_form_are_swept_from_a_dataset(tmp_path: Path) ->
 
 def test_an_emulated_port_replaces_and_removes_links_alone(tmp_path: Path) -> None:
     from tacpipe.simulation.emulation.serial_port import Pty
-    from tests.recording.test_reading import SENSOR
 
     for name in ("left", ".left"):
         write(tmp_path, {name: "mine"})
         with pytest.raises(UsageError, match="is not from an emulator"):
-            Pty(SENSOR, tmp_path / "left")
+            Pty(tmp_path / "left")
         assert (tmp_path / name).read_text() == "mine"
         (tmp_path / name).unlink()
     (tmp_path / "left").symlink_to("/dev/pts/of-an-emulator-that-was-killed")
-    port = Pty(SENSOR, tmp_path / "left")
+    port = Pty(tmp_path / "left")
     assert (tmp_path / "left").readlink().parent == Path("/dev/pts")
     (tmp_path / "left").unlink()
     write(tmp_path, {"left": "mine"})

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.metrics import intervals
+from tacpipe.scores import intervals
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import evaluated, trained
 from tests.test_docs import module

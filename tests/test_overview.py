@@ -10,7 +10,7 @@ import pytest
 
 from tacpipe.cli import headline_table
 from tacpipe.io import terminal
-from tacpipe.metrics import headline
+from tacpipe.scores import headline, words
 from tests import chain
 from tests.conftest import tacpipe
 
@@ -90,7 +90,7 @@ def test_a_result_of_before_headlines_says_so() -> None:
         "trained_on": {"roles": {}, "recordings": None},
         "inputs": {},
     }
-    assert "run `tacpipe evaluate` again" in model_overview.result_text(value)[0]
+    assert "run `tacpipe evaluate` again" in model_overview.to_text(value)[0]
 
 
 def test_a_split_is_shown_by_how_many_recordings_have_each_role(lab: Path) -> None:
@@ -122,10 +122,10 @@ def test_a_picture_hatches_the_padding_of_contacts(lab: Path, tmp_path: Path) ->
 
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:
     headlines = headline.read((lab / "results/forward/headline.json").read_bytes())
-    table = headline_table.text(headlines, terminal.width_of(sys.stderr))
+    table = headline_table.table(headlines, legend=False).text(terminal.width_of(sys.stderr))
     process = tacpipe(lab, EVALUATE)
     assert process.stdout == "results/forward\n"
-    assert "0 ran" in process.stderr and table in process.stderr
+    assert "0 ran" in process.stderr and table in process.stderr and words.sentence(headlines[0]) in process.stderr
 
 
 def test_quiet_hides_the_headline_and_json_carries_it(lab: Path) -> None:

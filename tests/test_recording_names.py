@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from tacpipe.engine import keys
-from tacpipe.plugins.stage import RecordingOutput, Source, stage
+from tacpipe.plugins.stage import Discovery, RecordingOutput, Source, stage
 from tacpipe.store.store import Store
 from tests.conftest import Lab, write_plugin
 
@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from tacpipe import RecordingOutput, TacpipeError, stage
+from tacpipe.plugins.stage import Discovery
 if TYPE_CHECKING:
     from tacpipe.plugins.stage import Files, RecordingName
 
@@ -35,7 +36,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     """Find one recording a folder."""
     return {path.parent.name: {"numbers.txt": path} for path in sorted(source.glob("*/numbers.txt"))}
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def read(params: Params, files: Files, called: RecordingName) -> RecordingOutput:
     """Read the numbers of a folder."""
     import pyarrow as pa
@@ -57,13 +58,13 @@ def discover(params: Params, source: Path) -> Mapping[str, Source]:
     return {}
 
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def nameless(params: Params, files: Files) -> RecordingOutput:
     """Read no name."""
     return RecordingOutput(pa.table({"x": [1]}))
 
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def read_name(params: Params, files: Files, name: RecordingName) -> RecordingOutput:
     """Read the name."""
     return RecordingOutput(pa.table({"x": [1]}), {"name": name})

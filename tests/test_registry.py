@@ -60,7 +60,7 @@ OWN_TASK = """
 from dataclasses import dataclass
 
 from tacpipe import Dataset, Result, stage
-from tacpipe.comparison.runs import TaskReport
+from tacpipe.report.context import TaskReport
 from tacpipe.report.blocks import Fold, SmallPrint
 from tacpipe.tasks.task import Task
 

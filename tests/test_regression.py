@@ -12,7 +12,7 @@ from sklearn import metrics as sklearn_metrics
 from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import intervals, regression
+from tacpipe.scores import intervals, regression
 
 PRINTED = {  # normalised RMSE and device units, test and novel objects (RA-L 2020, Figures 10 and 11)
     "pdc_th": ((0.05496, 49), (0.08289, 74)),

@@ -131,7 +131,8 @@ def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp
 def test_an_emulated_rig_file_does_not_replace_another_one(lab: Lab) -> None:
     text = '[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n'
     Path("rig.toml").write_text(text)
-    ran = lab.call("sensors emulate rig.toml -o . --duration-s 0.1")
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    ran = lab.call("sensors emulate rig.toml data/r -o . --duration-s 0.1")
     assert ran.code == 2 and "rig.toml already exists, and this command did not write it" in ran.err
     assert Path("rig.toml").read_text() == text
 

@@ -90,24 +90,24 @@ def test_materials_refuse_slides_without_touch() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_prints_what_it_needs_without_a_dataset_and_its_page_has_it(lab: Lab, task: str) -> None:
-    stage = registry.load(f"train.{task}")
-    assert stage.requirements is not None and stage.requirements.task == task
+    requirements = registry.requirements(f"train.{task}")
+    assert requirements is not None and requirements.task == task
     printed = lab.run(f"train {task} --requirements").out
-    assert printed == stage.requirements.to_text() + "\n"
-    for channels in stage.requirements.channels:
+    assert printed == requirements.to_text() + "\n"
+    for channels in requirements.channels:
         assert channels.quantity in printed and all(unit in printed for unit in channels.units)
     assert printed in (DOCS / f"{task}.md").read_text()
     assert max(map(len, printed.splitlines())) <= 112
     stage_names = registry.stages()
-    for name in stage.requirements.stages:
+    for name in requirements.stages:
         assert name.replace(" ", ".") in stage_names
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_options_that_requirements_name_exist(task: str) -> None:
-    stage = registry.load(f"train.{task}")
-    assert stage.requirements is not None
+    stage, requirements = registry.load(f"train.{task}"), registry.requirements(f"train.{task}")
+    assert requirements is not None
     flags = {f"--{name.replace('_', '-')}" for name in params_of.fields(stage)}
     flags |= {f"--{name.replace('_', '-')}" for name in params_of.fields(registry.load("segment.slides"))}
-    flags |= {"--from", "--interval"}
-    assert set(re.findall(r"--[a-z-]+", stage.requirements.to_text())) <= flags
+    flags |= {"--from", "--interval", "--truth"}
+    assert set(re.findall(r"--[a-z-]+", requirements.to_text())) <= flags

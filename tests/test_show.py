@@ -157,7 +157,7 @@ def test_of_streams_that_are_too_long_only_the_rows_are_listed(lab: Lab, monkeyp
     text = lab.run("show data/r").out
     assert "10 streams too long to read here" in text
     (robot, _) = [line.split() for line in text.splitlines() if " robot " in line]
-    assert robot == ["trial-000", "robot", str(tacpipe.open("data/r")["trial-000"].table("robot").num_rows)]
+    assert robot == ["trial-000", "robot", f"{tacpipe.open('data/r')['trial-000'].table('robot').num_rows:,}"]
     assert "too long" not in lab.run("show data/r --full").out
 
 

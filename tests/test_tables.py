@@ -67,7 +67,7 @@ def test_whatever_is_read_as_parquet_lies_in_memory_of_arrow_s_own() -> None:
                 argument = ast.unparse(call.args[0])  # `self._content` is what `ParquetTable` got from `owned`
                 assert argument.startswith("owned(") or argument == "self._content", f"{file}:{call.lineno}"
                 calls += 1
-    assert calls == 6
+    assert calls == 4
 
 
 @given(tables(), st.data())

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tacpipe.channels.schema import is_truth
 from tacpipe.channels.streams import columns_with_quantity, layout_entry, missing_channel_error, signal
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.printable import listed, plain
@@ -51,7 +52,6 @@ def shared_name(field: pa.Field) -> str:
 POSITION, ORIENTATION, WIDTH = "position", "orientation", "finger_width"  # quantities
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # metres per length unit
 DEFAULT_STREAM = "robot"  # stream of the arm if several streams have a position
-TRUTH = "gt_"  # prefix of ground-truth columns
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _vectors(schema: pa.Schema, quantity: str) -> dict[tuple[str, str], list[pa.
     fields_by_vector: dict[tuple[str, str], list[pa.Field]] = {}
     for field in schema:
         metadata = field.metadata or {}
-        if metadata.get(b"quantity") == quantity.encode() and not field.name.startswith(TRUTH):
+        if metadata.get(b"quantity") == quantity.encode() and not is_truth(field):
             key = metadata.get(b"stream", b"").decode(), shared_name(field)
             fields_by_vector.setdefault(key, []).append(field)
     return fields_by_vector

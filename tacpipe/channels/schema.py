@@ -11,13 +11,12 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from tacpipe.arrays import Times
 from tacpipe.printable import plain, suggestion
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from tacpipe.arrays import Times
 
 TAXELS = 16  # taxels of a XELA uSkin 4x4, numbered row by row
 ELECTRODES = 19  # electrodes of a BioTac
@@ -28,6 +27,8 @@ COMPONENTS = ("x", "y", "z", "w")
 # metadata of ``t_ns``: whether times are arrivals or sampling times, and the declared period in ns
 STAMPS, ARRIVAL, PERIOD = "stamps", "arrival", "period_ns"
 DAMAGED = "damaged"  # mask of the damaged frames of a stream
+TRUTH = "gt_"  # prefix of the ground truth of a simulation: columns and labels
+TRUTH_KEY = "truth"  # metadata of a measured column that is a target: "1". No stage reads it as input
 
 
 def time_field(origin: str | None = None, *, arrivals: bool = False, period_ns: int | None = None) -> pa.Field:
@@ -178,6 +179,18 @@ def field_metadata(field: pa.Field) -> dict[str, str]:
     return {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
 
 
+def is_truth(field: pa.Field) -> bool:
+    """Return whether a column is ground truth, by its name or its metadata. No stage takes such a column as input.
+
+    >>> import pyarrow as pa
+    >>> is_truth(pa.field("gt_slip", pa.int8())), is_truth(pa.field("ft_force_z", pa.float64()))
+    (True, False)
+    >>> is_truth(pa.field("ft_force_z", pa.float64(), metadata={TRUTH_KEY: "1"}))
+    True
+    """
+    return field.name.startswith(TRUTH) or (field.metadata or {}).get(TRUTH_KEY.encode()) == b"1"
+
+
 def label_field(name: str) -> pa.Field:
     """Return an int8 field of a label: 0 or 1, or a small number."""
     import pyarrow as pa
@@ -189,6 +202,7 @@ def stream(
     t_ns: Times, columns: Iterable[Any], fields: Sequence[pa.Field], stamp_origin: str | None = None
 ) -> pa.Table:
     """Return the table of a stream: ``t_ns`` (time,) and one column per field, each (time,), cast to the field's type."""
+    import numpy as np
     import pyarrow as pa
 
     arrays = [pa.array(t_ns, pa.int64())]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
+from tacpipe.channels.schema import is_truth
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed, plain
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 Table = TypeVar("Table", "pa.Table", "pa.Table | Columns")
 COUNT = "count"  # unit of raw readings
 EVENTS = "events"  # stream of problems during recording; not a signal
-TRUTH = "gt_"  # prefix of ground-truth columns
 _GAP_FACTOR = 3.0  # minimum gap as a multiple of the median step
 _PIECE_ROWS = 1 << 20  # number of rows in memory at once
 
@@ -105,8 +105,17 @@ def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
 
 
 def columns_with_quantity(table: pa.Table | Columns, quantity: str) -> list[str]:
-    """Return the columns of a stream with ``quantity``."""
-    return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
+    """Return the columns of a stream with ``quantity``, without ground truth."""
+    return columns_of_schema(table.schema, quantity)
+
+
+def columns_of_schema(schema: pa.Schema, quantity: str) -> list[str]:
+    """Return the names of the columns with ``quantity``, in the order of ``schema``, without ground truth."""
+    return [
+        field.name
+        for field in schema
+        if (field.metadata or {}).get(b"quantity") == quantity.encode() and not is_truth(field)
+    ]
 
 
 def common_unit(source: pa.Table | pa.Schema, names: Sequence[str]) -> str:
@@ -225,6 +234,7 @@ GRID = "grid"  # attribute of synchronized recordings: uniform, logged or fresh
 ARRIVAL, AT_ARRIVAL = "t_arrival_ns", "at_arrival"  # columns of synchronized recordings, beside t_ns
 GAP = "_gap"  # suffix of gap masks
 GAP_MS = "_gap_ms"  # suffix of attributes of synchronized recordings: longest time without a gap
+WITHOUT_TRUTH = "_rows_without_truth"  # suffix of attributes of synchronized recordings: rows without measured truth
 LOOK_AHEAD_MEAN, LOOK_AHEAD_MAX = "look_ahead_mean_ms", "look_ahead_max_ms"  # attributes of a synchronized recording
 WARNING_SHARE = 0.05  # fraction of rows in gaps above which users are warned
 _MAX_STEP = {"logged": 3.0, "fresh": 3.0}  # longest step without missing rows as a multiple of the median step, by grid

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.schema import is_truth
 from tacpipe.io import JsonObject
 from tacpipe.io.hashing import digest
 from tacpipe.printable import listed
@@ -104,7 +104,7 @@ class Stream(StreamName):
     def channels(self) -> Iterator[pa.Field]:
         """Yield the fields of the channels: columns that a sensor measured."""
         for column in self.columns.schema:
-            if not column.name.startswith(TRUTH) and quantity(column) not in NO_CHANNELS:
+            if not is_truth(column) and quantity(column) not in NO_CHANNELS:
                 yield column
 
 

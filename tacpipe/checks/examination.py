@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
@@ -117,7 +118,6 @@ def _values(stream: Stream, name: str, *, binary: bool) -> AnyArray:
     if not binary:
         values: AnyArray = stream.columns.column(name).to_numpy()
         return values
-    from hashlib import blake2b
 
     hashes = (
         blake2b(packet or b"", digest_size=8).digest()

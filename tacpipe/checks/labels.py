@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.schema import TRUTH
 from tacpipe.checks.check import Check, CheckFinding
 from tacpipe.datasets.consistency import normal_spelling
 from tacpipe.datasets.dataset import Dataset

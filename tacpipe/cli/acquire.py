@@ -13,6 +13,7 @@ import typer
 from tacpipe.errors import DONE, FAILED, DeviceError, TacpipeError, UsageError
 from tacpipe.io import terminal
 from tacpipe.plugins import registry
+from tacpipe.store.location import locate
 
 if TYPE_CHECKING:
     from tacpipe.recording.rig import Rig
@@ -77,7 +78,6 @@ def add(program: typer.Typer, help_text: str) -> None:
         terminal.set_quiet(quiet)
         from tacpipe.recording import rig as rig_of
         from tacpipe.recording import trials as trials_of
-        from tacpipe.store.location import locate
 
         commands: Any = registry.load_command("acquire")
         store = locate(*([] if output is None else [output]))

@@ -15,9 +15,11 @@ import typer
 import tacpipe
 from tacpipe.datasets import replacing
 from tacpipe.datasets.overview import describe_streams
+from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.io.files import readable_errors, write_whole
+from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
     from tacpipe.clouds.candidates import Candidate
@@ -96,7 +98,6 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
     """
     from tacpipe.clouds import files
     from tacpipe.clouds.cloud import Cloud
-    from tacpipe.engine import pipeline
 
     if path.suffix.lower() in files.SUFFIXES or (path.is_file() and path.name != "manifest.json"):
         if recording is not None:
@@ -127,10 +128,9 @@ def _name_excerpt(names: list[str]) -> str:
 
 def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
     """Return the grasp predictor of the model at ``path``. Raises `UsageError` if its task has none."""
-    from tacpipe.datasets import model_files
-    from tacpipe.plugins import registry
+    from tacpipe.tasks.task import task_of_model
 
-    task = model_files.task(tacpipe.open(path).files, str(path))
+    task = task_of_model(tacpipe.open(path).files, str(path))
     predict = task.grasp_predictor
     if predict is None:
         able = [name for name in registry.tasks() if registry.load_task(name).grasp_predictor is not None]

@@ -15,6 +15,7 @@ import typer
 
 import tacpipe
 from tacpipe.errors import FAILED, UsageError
+from tacpipe.formats import container
 from tacpipe.io import terminal
 
 if TYPE_CHECKING:
@@ -86,8 +87,6 @@ def _recordings(path: Path, layout: Path | None) -> Iterator[Dataset]:
 
 def _format(folder: Path, layout: Path | None) -> str:
     """Return the format of files: ``table`` for a layout that names files, else the kind of the containers."""
-    from tacpipe.formats import container
-
     if layout is not None:
         try:
             streams = tomllib.loads(layout.read_text(encoding="utf-8")).get("streams", {})

@@ -28,12 +28,10 @@ SUMMARIES = {
     "compare": "Compare results: the best first, columns for what differs.",
     "track": "Send models and results to trackers of experiments.",
     "view": "Show recordings on one time axis, in Rerun's viewer.",
-    "run": "Run the stages of a dvc.yaml that are not up to date.",
     "explain": "Show the origin of a dataset and what changed.",
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage the store: verify, repair, push, pull.",
     "candidates": "List grasps on an object, with the predicted touch of each.",
-    "limits": "Measure what limits the prediction of touch.",
     "demo": "Run a whole pipeline on simulated recordings.",
     "version": "Show the versions of tacpipe, Python and libraries.",
 }
@@ -132,11 +130,10 @@ def _add_show(program: typer.Typer) -> None:
             terminal.result(show_recording.draw(dataset, recording, plot))
             return
         if recording is not None:
-            opened = show_recording.overview(dataset, recording)
-            _print(opened.to_json() if as_json else opened, show_recording.to_text, as_json=as_json, full=full)
-            return
-        limit = None if full or as_json else overview.SHOWN
-        _print(overview.of(dataset, most=limit), overview.to_text, as_json=as_json, full=full)
+            value: overview.Shown = show_recording.overview(dataset, recording)
+        else:
+            value = overview.of(dataset, most=None if full or as_json else overview.SHOWN)
+        _print(value, overview.to_text, as_json=as_json, full=full)
 
 
 def _add_compare(program: typer.Typer) -> None:
@@ -167,8 +164,8 @@ def _add_compare(program: typer.Typer) -> None:
             elif as_csv:
                 terminal.result(comparison.to_csv())
             else:
-                for number, table in enumerate(comparison.tables()):
-                    terminal.result("") if number else None
+                for number, (sentences, table) in enumerate(comparison.tables()):
+                    terminal.result("\n".join(["", *sentences] if number else sentences))
                     terminal.show(table, on_stdout=True)
 
 
@@ -208,7 +205,8 @@ def _add_demo(program: typer.Typer) -> None:
     def demo(
         output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")] = Path("demo"),
         rig: Annotated[
-            Path | None, typer.Option("--rig", help="Rig file to emulate and record; the chain runs on that.")
+            Path | None,
+            typer.Option("--rig", help="Rig file: replay simulated trials as this rig, and record them."),
         ] = None,
     ) -> None:
         from tacpipe.cli import demo as demonstration
@@ -263,12 +261,10 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "compare": _add_compare,
     "track": _add_track,
     "view": _from_module("view"),
-    "run": _from_module("run"),
     "explain": _add_explain,
     "sensors": _from_module("sensors"),
     "store": _from_module("store"),
     "candidates": _from_module("candidates"),
-    "limits": _from_module("limits"),
     "demo": _add_demo,
     "version": _add_version,
 }

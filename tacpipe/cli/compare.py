@@ -18,8 +18,8 @@ from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Attribute
+from tacpipe.scores import headline, words
 from tacpipe.store.location import locate
 
 METRICS = "metrics.json"
@@ -156,15 +156,21 @@ class Compared:
         writer.writerows(records)
         return text.getvalue().rstrip("\n")
 
-    def tables(self) -> list[TerminalTable]:
-        """Return one table per task, kind of error and unit: methods with the best first, then their best baseline."""
+    def tables(self) -> list[tuple[list[str], TerminalTable]]:
+        """Return one table per task, kind of error and unit: methods with the best first, then their best baseline.
+
+        Above each are the sentences of how the best method of each question compares with its best baseline.
+        """
         by_columns: dict[tuple[str, ...], list[Comparison]] = {}
         for comparison in self.comparisons:
             measure = comparison.measure
             by_columns.setdefault((comparison.task, *measure.columns, measure.name, measure.unit), []).append(
                 comparison
             )
-        return [self._table(comparisons) for comparisons in by_columns.values()]
+        return [
+            (words.summary([found for comparison in same if (found := comparison.headline)]), self._table(same))
+            for same in by_columns.values()
+        ]
 
     def _table(self, comparisons: Sequence[Comparison]) -> TerminalTable:
         """Return the table of comparisons with the same columns: methods, then the best baseline and the reference baseline.
@@ -180,14 +186,14 @@ class Compared:
         baselines = [row.baseline for row in all_rows]
         names_baselines = len({*baselines}) > len(comparisons)  # Methods of one question have different best baselines
         pooled = any(row.runs > 1 for row in all_rows)
-        heads = ["", *differing, *measure.columns, measure.name, "95 % interval"]
+        heads = ["", *differing, *words.heads(measure.columns, measure.name), "95 % interval"]
         heads += [*(["vs"] if names_baselines else []), "n", *(["runs"] if pooled else [])]
         groups, index = [], 0
         for comparison, rows in zip(comparisons, rows_by_comparison, strict=True):
             lines = []
             for row in rows:
                 cells = [names[index], *(cells[index] for cells in differing.values())]
-                cells += [*map(headline.number, row.values), *_gain(row, measure.name)]
+                cells += [*words.cells(measure.columns, row.values), *_gain(row, measure.name)]
                 cells += [
                     *([row.baseline] if names_baselines else []),
                     f"{row.n:,}",
@@ -198,12 +204,22 @@ class Compared:
             best = comparison.best_baseline
             if best is not None:
                 empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
-                cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
+                cells = [
+                    f"than {best.name}",
+                    *[""] * len(differing),
+                    *words.cells(measure.columns, best.values),
+                    *empty,
+                ]
                 lines.append(TerminalRow(cells, "dim"))
                 for reference in (
                     row for row in comparison.of("baseline") if row.name == measure.reference and row is not best
                 ):
-                    cells = [reference.name, *[""] * len(differing), *map(headline.number, reference.values), *empty]
+                    cells = [
+                        reference.name,
+                        *[""] * len(differing),
+                        *words.cells(measure.columns, reference.values),
+                        *empty,
+                    ]
                     lines.append(TerminalRow(cells, "dim"))
             groups.append(
                 RowGroup(comparison.question.where if len(comparisons) > 1 or comparison.question.where else "", lines)
@@ -222,8 +238,6 @@ class Compared:
         """Return the caption of a table: units, what n counts, and the meaning of the measure and its intervals."""
         measure = comparisons[0].measure
         clusters = ", ".join(dict.fromkeys(comparison.measure.cluster for comparison in comparisons))
-        skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
-        points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
         fewest = min(row.n for comparison in comparisons for row in comparison.rows)
         few_note = (
             f" With n below {headline.MIN_CLUSTERS} no interval proves a difference."
@@ -231,12 +245,12 @@ class Compared:
             else ""
         )
         chosen = max(len(comparison.models) for comparison in comparisons)
-        chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""
+        chosen_from = f" The sentence accounts for the choice among {chosen} methods." if chosen > 1 else ""
         pooled = "Runs that differ only in seed or fold are pooled (--each lists them). " if self.pooled else ""
         return (
-            f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
-            f"jackknife over {clusters} and over seeds where there are several, method and baseline on the same ones."
-            f"{chosen_from}{few_note}"
+            f"n: {clusters}. Units: {measure.unit}. {words.explain_gain(measure.name, measure.ranked_by)} {pooled}"
+            f"Intervals: jackknife over {clusters} and over seeds where there are several, method and baseline on the same "
+            f"ones.{chosen_from}{few_note}"
         )
 
 
@@ -275,10 +289,9 @@ def _first_name(row: engine.ComparisonRow) -> str:
 def _gain(row: engine.ComparisonRow, measure: str) -> list[str]:
     """Return the gain over the best baseline and its interval as texts, "–" for those that are missing."""
     if not row.baseline:
-        return [headline.NONE, headline.NONE]
-    low, high = (headline.format_gain(value, measure) for value in (row.gain.low, row.gain.high))
-    interval = headline.NONE if math.isnan(row.gain.low) else f"{low} to {high}"
-    return [headline.format_gain(row.gain.mean, measure), interval]
+        return [words.NONE, words.NONE]
+    interval = words.format_interval(row.gain.low, row.gain.high, measure) or words.NONE
+    return [words.format_gain(row.gain.mean, measure), interval]
 
 
 def _style(row: engine.ComparisonRow) -> str:

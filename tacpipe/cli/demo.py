@@ -24,12 +24,14 @@ NEXT = """Open the page below in a browser. What to try next:
 
 
 def run_rig(output: Path, rig_file: Path) -> Path:
-    """Emulate a rig, record it live, process the recordings, and return the path of the report.
+    """Simulate trials, replay them as a rig, record it live, process the recordings, and return the path of the report.
 
     Raises `TacpipeError` if a command fails.
     """
     extras.require("The demo on a rig", *LEARNING, *LINKS)
-    emulate = ["sensors", "emulate", str(rig_file), "-o", str(output / EMULATED)]
+    simulated = str(output / "simulated")
+    _run([[*demo.simulated, "-o", simulated] for demo in demo_parts(output) if demo.simulated])
+    emulate = ["sensors", "emulate", str(rig_file), simulated, "-o", str(output / EMULATED)]
     terminal.note("$ tacpipe " + " ".join(emulate) + " &")
     serving = subprocess.Popen([sys.executable, "-P", "-m", "tacpipe", *emulate], stdout=subprocess.PIPE)
     assert serving.stdout is not None
@@ -65,10 +67,10 @@ def _run(commands: list[list[str]]) -> None:
 def headline_of(result: Path) -> str:
     """Return a sentence that compares the model of a result with its best baseline, or that there is none."""
     from tacpipe.cli import headline_table
-    from tacpipe.metrics import headline
+    from tacpipe.scores import headline, words
 
     headlines = headline_table.of_output(result, headline.FILE)
-    return f"{headlines[0].task}: {headline.sentence(headlines[0])}" if headlines else headline_table.EMPTY
+    return f"{headlines[0].task}: {words.sentence(headlines[0])}" if headlines else headline_table.EMPTY
 
 
 def run(output: Path) -> Path:
@@ -93,8 +95,8 @@ EMULATED = "emulated"  # folder of the rig file written by the emulation
 def demo_commands(output: Path) -> list[list[str]]:
     """Return the commands of all tasks' demos and of the results page, without the leading ``tacpipe``."""
     demos = demo_parts(output)
-    datasets = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
-    return [*(words for demo in demos for words in demo.commands), ["report", *datasets, "-o", str(demo_page(output))]]
+    results = [name for demo in demos for name in demo.results]
+    return [*(words for demo in demos for words in demo.commands), ["report", *results, "-o", str(demo_page(output))]]
 
 
 def demo_rig(output: Path) -> list[list[str]]:

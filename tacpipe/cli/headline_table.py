@@ -9,10 +9,10 @@ from pathlib import Path
 from tacpipe.datasets import manifest
 from tacpipe.io import terminal
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics import headline
-from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ParamValue
+from tacpipe.scores import headline, words
+from tacpipe.scores.headline import Headline
 from tacpipe.store.location import locate
 
 EMPTY = "All recordings were used for training or contain no window, so there is nothing to evaluate."
@@ -34,56 +34,49 @@ def method(task: object, stored: ParamValue) -> str:
     return str(params_of.with_current_names(f"train.{task}", {"architecture": stored})["architecture"])
 
 
-def table(headlines: Sequence[Headline]) -> TerminalTable:
-    """Return a table of headlines with a group of rows per headline: the model, its best baseline, and other baselines."""
+def table(headlines: Sequence[Headline], *, legend: bool = True) -> TerminalTable:
+    """Return a table of headlines with a group of rows per headline: the model, its best baseline, and other baselines.
+
+    The legend explains the columns, the unit of n, and the number of baselines from which the best was chosen.
+    """
     first = headlines[0]
-    heads = ["", *first.columns, first.measure, "95 % interval", "n"]
+    heads = ["", *words.heads(first.columns, first.measure), "95 % interval", "n"]
     groups = []
     for entry in headlines:
         styles = {headline.BETTER: "green", headline.WORSE: "red"}
-        gain = headline.format_gain(entry.gain, entry.measure) if entry.best else headline.NONE
-        interval = headline.bounds(entry) or headline.NONE
-        cells = [entry.method, *map(headline.number, entry.model.values), gain, interval]
+        gain = words.format_gain(entry.gain, entry.measure) if entry.best else words.NONE
+        cells = [entry.method, *words.cells(first.columns, entry.model.values), gain, words.bounds(entry) or words.NONE]
         rows = [TerminalRow([*cells, f"{entry.clusters:,}"], styles.get(entry.verdict, ""))]
         if entry.best:
-            values = map(headline.number, entry.best.values)
-            rows.append(
-                TerminalRow(
-                    [f"vs {entry.best.name.replace('_', ' ')}", *values, "", _VERDICTS[entry.verdict], ""], "dim"
-                )
-            )
+            values, name = words.cells(first.columns, entry.best.values), entry.best.name.replace("_", " ")
+            rows.append(TerminalRow([f"than {name}", *values, "", words.CELLS[entry.verdict], ""], "dim"))
             baselines = [row for row in entry.table_baselines if row is not entry.best]
-            rows += [TerminalRow([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
+            cells_of_baselines = [[row.name, *words.cells(first.columns, row.values), "", "", ""] for row in baselines]
+            rows += [TerminalRow(cells, "dim") for cells in cells_of_baselines]
         groups.append(RowGroup(entry.where, rows))
     errors = list(range(1, len(first.columns)))  # The last column ranks the results.
-    return TerminalTable(
-        heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)]
-    )
+    spare = [*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)]
+    return TerminalTable(heads, groups, explain(headlines) if legend else "", spare=spare)
 
 
-def caption(headlines: Sequence[Headline]) -> str:
-    """Explain the columns, the unit of n, and the number of baselines from which the best was chosen."""
+def explain(headlines: Sequence[Headline]) -> str:
+    """Return the legend of a table of headlines."""
     counts = dict.fromkeys(len(entry.baselines) for entry in headlines if entry.baselines)
-    best = f"vs: the best of {' or '.join(map(str, counts))} baselines. " if counts else ""
-    return f"n: {', '.join(dict.fromkeys(entry.cluster for entry in headlines))}. {best}{headline.caption(headlines)}"
-
-
-_VERDICTS = {
-    headline.BETTER: "model is better",
-    headline.WORSE: "baseline is better",
-    headline.UNCLEAR: "no difference",
-    headline.NO_VERDICT: "n is too small",
-}
+    best = f"Than: the best of {' or '.join(map(str, counts))} baselines. " if counts else ""
+    return f"n: {', '.join(dict.fromkeys(entry.cluster for entry in headlines))}. {best}{words.legend(headlines)}"
 
 
 def text(headlines: Sequence[Headline], width: int = terminal.WIDTH) -> str:
-    """Return headlines as lines of text: their table, or a sentence if there are none."""
-    return table(headlines).text(width) if headlines else EMPTY
+    """Return headlines as lines of text: their sentences and their table, or a sentence if there are none."""
+    return "\n".join([*words.summary(headlines), "", table(headlines).text(width)]) if headlines else EMPTY
 
 
-def show(headlines: Sequence[Headline]) -> None:
-    """Print headlines to stderr, or that there are none."""
-    if headlines:
-        terminal.show(table(headlines), on_stdout=False)
-    else:
+def show(headlines: Sequence[Headline], output: Path) -> None:
+    """Print the sentences and the table of the headlines of a result to stderr, or that there are none."""
+    if not headlines:
         terminal.note(EMPTY)
+        return
+    for line in words.summary(headlines):
+        terminal.note(line)
+    terminal.show(table(headlines, legend=False), on_stdout=False)
+    terminal.note(f"tacpipe show {output} explains the columns.")

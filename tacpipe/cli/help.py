@@ -52,8 +52,8 @@ SECTIONS = {  # commands in the order of ``tacpipe --help``; stages from other p
     "Import and export": ("ingest", "simulate", "export"),
     "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
     "Train and evaluate": ("train", "calibrate", "evaluate", "predict", "compare", "report", "track"),
-    "Look": ("show", "check", "view", "explain", "candidates", "limits"),
-    "Manage": ("run", "store", "demo", "version"),
+    "Look": ("show", "check", "view", "explain", "candidates"),
+    "Manage": ("store", "demo", "version"),
 }
 PLUG_INS = "Plug-ins"
 

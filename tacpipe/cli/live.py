@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tacpipe.datasets import directory
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io import terminal
+from tacpipe.io.termination import EndRequest
+from tacpipe.live import settings
+from tacpipe.plugins import fields, params
+from tacpipe.recording import clock
+from tacpipe.store import location
 
 if TYPE_CHECKING:
     from tacpipe.io.termination import EndRequest
@@ -88,8 +93,6 @@ def add(program: typer.Typer, summary: str) -> None:
 
 def _options() -> list[inspect.Parameter]:
     """Return the options of common settings and of each task's settings; the first task to define a name wins."""
-    from tacpipe.live import settings
-
     options = _options_for(settings.Settings, None)
     for task, kind in settings.task_settings().items():
         options |= {
@@ -99,11 +102,8 @@ def _options() -> list[inspect.Parameter]:
 
 
 def _options_for(kind: type[Any], panel: str | None) -> dict[str, inspect.Parameter]:
-    """Return an option for each setting of a class, by name, in a panel of the help; help texts only if help is printed."""
-    from tacpipe.live import settings
-    from tacpipe.plugins import fields, params
-
-    helps = params.comments_of(kind) if {"--help", "-h"} & set(sys.argv) else {}
+    """Return an option for each setting of a class, by name, in a panel of the help."""
+    helps = params.comments_of(kind)
     options = {}
     for name in settings.keys(kind):
         annotation = fields.hints(kind)[name]
@@ -143,14 +143,11 @@ def _run(
 
     Raises the errors of the rig and the model, and ends the program with an error if streams were lost.
     """
-    from tacpipe.datasets import directory
-    from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
     from tacpipe.recording import appending, trials
     from tacpipe.recording.pictures import serve_pictures
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.watch import RigView
-    from tacpipe.store import location
 
     store = location.locate(*([] if output is None else [output]))
     plan: trials_of.RecordingPlan | None = None
@@ -193,8 +190,6 @@ def _lines(supervisor: Supervisor) -> list[str]:
 
 def _run_unrecorded(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:
     """Run the rig without recording until it ``is_over`` or ``duration_s`` have passed; None for no limit."""
-    from tacpipe.recording import clock
-
     start_s = clock.now_s()
     recorder.follow()
 

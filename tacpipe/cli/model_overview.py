@@ -5,26 +5,24 @@ from __future__ import annotations
 import json
 import math
 import sys
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 from tacpipe.cli import headline_table
+from tacpipe.cli.description import SHOWN, align, flat
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.lineage import identities_of_manifests
 from tacpipe.datasets.manifest import Found, InputDataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Scalar, terminal
-from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import StoredParams, Values
+from tacpipe.scores import headline, words
 from tacpipe.store.store import Store
 from tacpipe.training.following import Line
 
 CONFIG, METRICS, HISTORY = "config.json", "metrics.json", "history.jsonl"
 WEIGHTS = ".safetensors"
-FILES = 5  # maximum number of files of a result that are listed; further files are counted
-SHOWN = 8  # maximum length of a displayed list or nested mapping; longer ones are counted
 _APART = ("task", "architecture", "params", "counts", "validation", "trained_on", "parameters", "seconds")
 _ROLES = ("train", "val", "test")
 
@@ -42,13 +40,6 @@ def is_result(opened: Dataset) -> bool:
 Figures = Mapping[str, Scalar | Mapping[str, Scalar]]  # counts or measures by name, or by role and sensor
 
 
-class ModelOrigin(TypedDict):
-    """Task and current architecture name of a configuration."""
-
-    task: str | None
-    architecture: str | None
-
-
 class TrainingCounts(TypedDict):
     """Numbers of recordings that a model was trained on."""
 
@@ -56,11 +47,14 @@ class TrainingCounts(TypedDict):
     roles: Figures  # number of recordings by role, or by role and sensor
 
 
-class ModelDescription(ModelOrigin):
-    """Description of a configuration: task, architecture, training data, and other short entries as text."""
+class TrainingOverview(TypedDict):
+    """Entries for models and for their results: the task, and how the model was trained."""
 
+    task: str | None
+    architecture: str | None  # its current name
     trained_on: TrainingCounts
-    about: dict[str, str]
+    params: StoredParams
+    inputs: dict[str, list[str]]  # paths and digests by argument name
 
 
 class BestEpoch(TypedDict):
@@ -70,18 +64,17 @@ class BestEpoch(TypedDict):
     loss: float
 
 
-class ModelOverview(ModelDescription):
-    """Overview of a model: task, architecture, training data, params and validation."""
+class ModelOverview(TrainingOverview):
+    """Overview of a model: its size, validation, and the short entries of its configuration."""
 
+    about: dict[str, str]  # other entries as text
     parameters: int | None
     epochs: int | None
     validation: Figures | BestEpoch | None
-    params: StoredParams
-    inputs: dict[str, list[str]]  # paths and digests by argument name
     chain: list[str]
 
 
-class ResultOverview(ModelOrigin):
+class ResultOverview(TrainingOverview):
     """Overview of a result: the model and its baselines, the evaluated data and their role."""
 
     headline: list[Values] | None
@@ -90,9 +83,6 @@ class ResultOverview(ModelOrigin):
     by_part: dict[str, Figures]
     fold: int | None
     role: str | None
-    trained_on: TrainingCounts
-    params: StoredParams
-    inputs: dict[str, list[str]]  # paths and digests by argument name
 
 
 def of_model(opened: Dataset, store: Store) -> ModelOverview:
@@ -101,13 +91,13 @@ def of_model(opened: Dataset, store: Store) -> ModelOverview:
     Raises the errors of `_read_tree`.
     """
     config, history = _read_tree(opened, CONFIG), _history(opened)
+    about = {name.replace("_", " "): _short_text(entry) for name, entry in config.items() if name not in _APART}
     return {
-        **_describe_config(config),
+        **_describe_training(opened, {"params": opened.source.params, **config}, store),
+        "about": {name: text for name, text in about.items() if text is not None},
         "parameters": config.get("parameters") or _count_parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
-        "params": params_of.with_current_names(opened.source.stage, config.get("params", opened.source.params)),
-        "inputs": _inputs(opened.source.inputs, store),
         "chain": [f"{step['stage']} {step['version']}" for step in opened.source.chain],
     }
 
@@ -117,11 +107,11 @@ def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
 
     ``found`` is its manifest in ``store``. Raises the errors of `_read_tree`.
     """
-    config, metrics = _read_tree(opened, CONFIG), _read_tree(opened, METRICS)
+    metrics = _read_tree(opened, METRICS)
     headlines = headline_table.read(opened.files[headline.FILE]) if headline.FILE in opened.files else None
     identity = identities_of_manifests(store).get(found.digest)
     return {
-        **_architecture(config),
+        **_describe_training(opened, _read_tree(opened, CONFIG), store),
         "headline": None if headlines is None else [entry.to_json() for entry in headlines],
         "baselines": list(dict.fromkeys(row.name for entry in headlines or () for row in entry.baselines)),
         "evaluated_on": metrics.get("counts", {}),
@@ -130,110 +120,62 @@ def of_result(opened: Dataset, found: Found, store: Store) -> ResultOverview:
         },
         "fold": None if identity is None else identity.get("fold"),
         "role": ((identity and identity.get("role")) or "test") if "split" in opened.source.inputs else None,
-        "trained_on": _describe_config(config)["trained_on"],
-        "params": params_of.with_current_names(f"train.{config.get('task')}", config.get("params", {})),
-        "inputs": _inputs(opened.source.inputs, store),
     }
 
 
-def model_text(value: ModelOverview) -> list[str]:
-    """Return the overview of a model as lines: summary with validation, params, then inputs."""
-    described = [
-        ("task", value["task"]),
-        ("architecture", value["architecture"]),
-        ("parameters", f"{value['parameters']:,}" if value["parameters"] else None),
-        *_named_once("trained on", _describe_training(value["trained_on"])),
-        ("epochs", value["epochs"]),
-        ("validation", flat(value["validation"]) if value["validation"] else None),
-        *value["about"].items(),
-        ("params", flat(value["params"])),
-        ("behind", ", then ".join(value["chain"]) or None),
-        *_input_rows(value["inputs"]),
-    ]
-    return [_summary(value), "", *_align_columns(described)]
-
-
-def _summary(value: ModelOverview) -> str:
-    """Return architecture, task, number of epochs and validation result on one line, without those that are missing."""
-    parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
-    if value["epochs"]:
-        parts.append(headline.format_count(value["epochs"], "epochs"))
-    if value["validation"]:
-        parts.append(f"validation: {flat(value['validation'])}")
-    return "; ".join(parts)
-
-
-def result_text(value: ResultOverview) -> list[str]:
-    """Return the overview of a result as lines, starting with the headline table."""
-    if value["headline"] is None:
-        lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
-    else:
-        headlines = [headline.Headline.from_json(entry) for entry in value["headline"]]
-        lines = headline_table.text(headlines, terminal.width_of(sys.stdout)).splitlines()
-    parts = {name: flat(counts) for name, counts in value["by_part"].items()}
-    fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
-    described = [
-        ("task", value["task"]),
-        ("architecture", value["architecture"]),
-        ("evaluated on", flat(value["evaluated_on"])),
-        *((f"  {name}", text) for name, text in parts.items()),
-        ("role", f"{value['role']}{fold}" if value["role"] else None),
-        ("baselines", ", ".join(value["baselines"]) or None),
-        ("params", flat(value["params"]) if value["params"] else None),
-        *_named_once("trained on", _describe_training(value["trained_on"])),
-        *_input_rows(value["inputs"]),
-    ]
-    return [*lines, "", *_align_columns(described)]
-
-
-def flat(value: Any) -> str:
-    """Return a nested value as one line; long lists are replaced by their length.
-
-    >>> flat({"train": {"a": 35, "b": 33}, "val": 2, "names": []}), flat(list(range(20))), flat(None), flat(0.5)
-    ('train a 35, train b 33, val 2', '20 values', '–', '0.5')
-    """
-    return ", ".join(f"{name} {described}".strip() for name, described in _leaves(value)) or headline.NONE
-
-
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the text of each value in nested values; long lists are replaced by their length."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, f"{name} {key}".strip().replace("_", " "))
-    elif isinstance(value, list):
-        if len(value) > SHOWN:
-            yield name, f"{len(value)} values"
-        elif value:
-            yield name, " ".join(map(str, value))
-    elif isinstance(value, float):
-        yield name, f"{value:.6g}"
-    elif value is not None and value != "":
-        yield name, str(value)
-
-
-def _architecture(config: Values) -> ModelOrigin:
-    """Return the task and current architecture name of a configuration; both are None if it has none."""
-    task, stored = config.get("task"), config.get("architecture")
-    return {"task": task, "architecture": None if stored is None else headline_table.method(task, stored)}
-
-
-def _describe_config(config: Values) -> ModelDescription:
-    """Return the task, architecture, training data and other short entries of a configuration."""
-    trained = config.get("trained_on")
-    about = {}
-    for name, entry in config.items():
-        text = _short_text(entry)
-        if name not in _APART and text is not None:
-            about[name.replace("_", " ")] = text
+def _describe_training(opened: Dataset, config: Values, store: Store) -> TrainingOverview:
+    """Return the entries of the configuration of a model, or of the model of a result, and the inputs of the dataset."""
+    task, architecture, trained = config.get("task"), config.get("architecture"), config.get("trained_on")
     return {
-        **_architecture(config),
+        "task": task,
+        "architecture": None if architecture is None else headline_table.method(task, architecture),
         "trained_on": {
             # training and validation recordings
             "recordings": len(trained) if isinstance(trained, Mapping) else None,
             "roles": {role: count for role, count in config.get("counts", {}).items() if role in _ROLES},
         },
-        "about": about,
+        "params": params_of.with_current_names(f"train.{task}", config.get("params", {})),
+        "inputs": _inputs(opened.source.inputs, store),
     }
+
+
+def to_text(value: Mapping[str, Any]) -> list[str]:
+    """Return the overview of a model or a result as lines: its summary or its headlines, then its other entries by name."""
+    if "headline" not in value:
+        lines = [_summary(value)]
+    elif value["headline"] is None:
+        lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
+    else:
+        headlines = [headline.Headline.from_json(entry) for entry in value["headline"]]
+        lines = headline_table.text(headlines, terminal.width_of(sys.stdout)).splitlines()
+    fold = f", fold {value['fold']}" if value.get("fold") is not None else ""
+    described = [
+        ("task", value["task"]),
+        ("architecture", value["architecture"]),
+        ("parameters", f"{value['parameters']:,}" if value.get("parameters") else None),
+        ("evaluated on", flat(value["evaluated_on"]) if "evaluated_on" in value else None),
+        *((f"  {name}", flat(counts)) for name, counts in value.get("by_part", {}).items()),
+        ("role", f"{value['role']}{fold}" if value.get("role") else None),
+        ("baselines", ", ".join(value.get("baselines", []))),
+        ("trained on", _count_training(value["trained_on"])),
+        ("epochs", value.get("epochs")),
+        ("validation", flat(value["validation"]) if value.get("validation") else None),
+        *value.get("about", {}).items(),
+        ("params", flat(value["params"]) if value["params"] else None),
+        ("behind", ", then ".join(value.get("chain", []))),
+        *value["inputs"].items(),
+    ]
+    return [*lines, "", *align(described)]
+
+
+def _summary(value: Mapping[str, Any]) -> str:
+    """Return architecture, task, number of epochs and validation result on one line, without those that are missing."""
+    parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
+    if value["epochs"]:
+        parts.append(words.format_count(value["epochs"], "epochs"))
+    if value["validation"]:
+        parts.append(f"validation: {flat(value['validation'])}")
+    return "; ".join(parts)
 
 
 def _short_text(value: Any) -> str | None:
@@ -252,24 +194,14 @@ def _short_text(value: Any) -> str | None:
     return flat(value) if value not in (None, "") else None
 
 
-def _describe_training(trained: TrainingCounts) -> list[str]:
+def _count_training(trained: TrainingCounts) -> list[str]:
     """Return a line per role with its counts of training data, and a line with the number of recordings."""
     lines = [
         f"{role}: {flat(counts) if isinstance(counts, Mapping) else counts}"
         for role, counts in trained["roles"].items()
     ]
     count = trained["recordings"]
-    return [*lines, *([headline.format_count(count, "recordings") + " of training and validation"] if count else [])]
-
-
-def _input_rows(inputs: Mapping[str, Sequence[str]]) -> list[tuple[str, str]]:
-    """Return rows of name and text for the inputs of a dataset; only the first of an argument has its name."""
-    return [row for name, descriptions in inputs.items() for row in _named_once(name, descriptions)]
-
-
-def _named_once(name: str, texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Return rows of name and text, of which only the first has the name."""
-    return [(name if not index else "", text) for index, text in enumerate(texts)]
+    return [*lines, *([words.format_count(count, "recordings") + " of training and validation"] if count else [])]
 
 
 def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:
@@ -314,46 +246,3 @@ def _count_parameters(opened: Dataset) -> int | None:
             header = json.loads(content[8 : 8 + size])
             count += sum(math.prod(tensor["shape"]) for key, tensor in header.items() if key != "__metadata__")
     return count or None
-
-
-def _align_columns(described: list[tuple[str, Any]]) -> list[str]:
-    """Return names and values in two aligned columns, with long values wrapped and values of None omitted."""
-    filled = [(name, str(value)) for name, value in described if value is not None and value != ""]
-    width = max((len(name) for name, _ in filled), default=0) + 2
-    text_width = max(terminal.width_of(sys.stdout) - width, 20)
-    rows = [row for name, value in filled for row in _named_once(name, _wrap_at_commas(value, text_width))]
-    return [f"{name:<{width}}{line}" for name, line in rows]
-
-
-def _wrap_at_commas(text: str, width: int) -> list[str]:
-    """Return text wrapped after commas.
-
-    >>> _wrap_at_commas("epochs 2, learning rate 0.002, seed 0", 20)
-    ['epochs 2,', 'learning rate 0.002,', 'seed 0']
-    """
-    unbroken = text.replace(" ", "\0").replace(",\0", ", ")
-    lines = textwrap.wrap(unbroken, width, break_long_words=False, break_on_hyphens=False)
-    return [line.replace("\0", " ") for line in lines]
-
-
-def files_text(files: Mapping[str, int], *, full: bool = False) -> list[str]:
-    """Return names and sizes of files; only the count and the first names if there are many and ``full`` is false.
-
-    >>> files_text({"config.json": 15696, "history.jsonl": 188})
-    ['files  config.json 15.7 kB, history.jsonl 188 bytes']
-    >>> " ".join(files_text(dict.fromkeys("abcdefgh", 1000))).split()[:5]
-    ['files', '8,', 'together', '8.0', 'kB:']
-    """
-    names = [f"{name} {_size(size)}" for name, size in files.items()]
-    if full or len(names) <= FILES + 1:
-        return _align_columns([("files", ", ".join(names))])
-    total = _size(sum(files.values()))
-    text = f"{len(names)}, together {total}: {', '.join(names[:FILES])} and {len(names) - FILES} more"
-    return _align_columns([("files", f"{text} (--full)")])
-
-
-def _size(count: int) -> str:
-    for factor, unit in ((1e6, "MB"), (1e3, "kB")):
-        if count >= factor:
-            return f"{count / factor:.1f} {unit}"
-    return f"{count} bytes"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
@@ -22,16 +21,14 @@ if TYPE_CHECKING:
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 SCHEMA_VERSION = 1
-EMULATION = "tacpipe.cli.sensors"
 
 
 def add(program: typer.Typer, summary: str) -> None:
-    """Add the group ``sensors`` to ``program``, without ``emulate`` if the simulation is not installed."""
+    """Add the group ``sensors`` to ``program``."""
     group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
     group.command("list")(list_)
     group.command("probe")(probe)
-    if find_spec("tacpipe.simulation.emulation") and find_spec(EMULATION):
-        add_emulate(group)
+    group.command("emulate", help=EMULATE_SUMMARY + EMULATE_EXAMPLE)(emulate)
     program.add_typer(group, name="sensors")
 
 
@@ -241,53 +238,41 @@ def _json(report: Report) -> PortJson:
     }
 
 
-EMULATE_SUMMARY = "Emulate the streams of a rig without hardware."
+EMULATE_SUMMARY = "Replay recordings as the devices of a rig."
 EMULATE_EXAMPLE = (
-    "\n\nEach stream sends its sensor's own bytes at its own rate. FOLDER/rig.toml is the rig file with the emulated "
-    "addresses: give it to `tacpipe acquire`. FOLDER/ledger lists at the end what was sent and which bytes were changed."
-    "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml -o emulated --faults noise=0.5,drop=0.001"
+    "\n\nEach stream sends its recorded samples at their times, again and again, as its sensor's own bytes. "
+    "FOLDER/rig.toml is the rig file with the emulated addresses: give it to `tacpipe acquire`. A device that waits for "
+    "requests, and a link such as HID or CAN, is replaced by the sensor `generic` with the same columns."
+    "\n\nExample: tacpipe sensors emulate rigs/first-paper.toml data/recordings -o emulated"
 )
 EMULATION_MARK = b"\nsimulated = true\n"  # line that marks the rig file of an emulated rig
-SWITCH_S = 0.0005  # maximum delay of the pacing thread by the planning thread; Python's 5 ms would be visible at 1 kHz
-
-
-def add_emulate(program: typer.Typer) -> None:
-    """Add the command ``emulate`` to ``program``."""
-    program.command("emulate", help=EMULATE_SUMMARY + EMULATE_EXAMPLE)(emulate)
 
 
 def emulate(
     rig: Annotated[Path, typer.Argument(help="Rig file.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for rig.toml, pseudo-terminals and the ledger.")
-    ],
+    recordings: Annotated[Path, typer.Argument(help="Recordings of acquire, simulate or ingest.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for rig.toml and pseudo-terminals.")],
     duration: Annotated[
         float | None, typer.Option("--duration-s", help="Duration, s; without it, until Ctrl-C.")
     ] = None,
-    faults: Annotated[str, typer.Option("--faults", help="Faults to add: noise=0.5,cut=0.2,flip=1,drop=0.001 …")] = "",
-    seed: Annotated[int, typer.Option("--seed", help="Random seed of the simulated world and of the faults.")] = 0,
 ) -> None:
     """Serve a rig."""
+    import tacpipe
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
     from tacpipe.io.termination import EndRequest
     from tacpipe.recording import rig as rig_files
-    from tacpipe.recording.rig import read
-    from tacpipe.simulation.emulation import byte_faults
-    from tacpipe.simulation.emulation.emulator import Emulator
+    from tacpipe.simulation.emulation.emulator import ReplayEmulator
 
-    parsed_rig, parsed_faults, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
+    parsed_rig, path = rig_files.read(rig), output / "rig.toml"
+    dataset = tacpipe.open(recordings)
     replacing.refuse_foreign(path, EMULATION_MARK)
-    sys.setswitchinterval(SWITCH_S)
-    with EndRequest() as is_over, readable_errors(output):
-        with Emulator(parsed_rig, seed, parsed_faults, output) as emulator:
-            write_whole(str(path), rig_files.to_toml(emulator.rig).encode(), f"{path}.draft")
-            terminal.result(path)
-            for name, stream in emulator.rig.streams.items():
-                terminal.note(f"{name}: {stream.kind} at {stream.address}")
-            is_over.wait(duration)
-        for ledger in emulator.ledger.values():
-            ledger.write(output / "ledger")
-    for name, ledger in emulator.ledger.items():
-        counts = ", ".join(f"{count} {cause}" for cause, count in ledger.counts.items())
-        terminal.note(f"{name}: {counts or 'nobody listened'}")
+    emulator = ReplayEmulator(parsed_rig, dataset, output)
+    with EndRequest() as is_over, readable_errors(output), emulator:
+        write_whole(str(path), rig_files.to_toml(emulator.rig).encode(), f"{path}.draft")
+        terminal.result(path)
+        for name, stream in emulator.rig.streams.items():
+            replaced = parsed_rig.streams[name].kind
+            note = f", instead of {replaced}" if replaced != stream.kind else ""
+            terminal.note(f"{name}: {stream.kind} at {stream.address}{note}")
+        is_over.wait(duration)

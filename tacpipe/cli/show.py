@@ -13,8 +13,10 @@ from typing import Any, Literal, TypedDict
 
 from tacpipe import printable
 from tacpipe.channels import streams
-from tacpipe.cli import model_overview
-from tacpipe.cli.show_recording import RATES, StreamFigures, gaps_text, stream_figures
+from tacpipe.channels.schema import TRUTH
+from tacpipe.cli import model_overview, show_recording
+from tacpipe.cli.description import files_text, flat, further
+from tacpipe.cli.show_recording import RATES, StreamFigures, stream_figures, streams_table
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import lineage
 from tacpipe.datasets import manifest as manifest_of
@@ -23,18 +25,17 @@ from tacpipe.datasets.lineage import CountedRows
 from tacpipe.datasets.selection import RecordingAttributes
 from tacpipe.engine import execution
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.rows import TABLE_HEADS, table_of_rows
 from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
 from tacpipe.recording import spool_folders
+from tacpipe.scores.words import format_count
 from tacpipe.store.location import locate
 from tacpipe.store.store import Store
 
 SHOWN = 20  # maximum number of recordings that are listed; further ones are counted
 # maximum number of stored bytes to read; further streams are listed with only their number of rows
 READ_BYTES = 1 << 28
-_TRUTH = "gt_"  # prefix of the simulator's ground-truth labels
 _SPLIT = ("recording", "fold", "role")  # columns of a split
 
 
@@ -85,7 +86,7 @@ class ShownRecordings(DatasetOverview):
     excluded: dict[str, str]  # reasons by recording
 
 
-Shown = ShownModel | ShownResult | ShownExport | ShownSplit | ShownRecordings
+Shown = ShownModel | ShownResult | ShownExport | ShownSplit | ShownRecordings | show_recording.RecordingOverview
 
 
 def of(path: Path, *, most: int | None = None) -> Shown:
@@ -174,17 +175,17 @@ def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> d
 
 def to_text(value: Shown, *, full: bool = False) -> str:
     """Return the overview as lines, with limited lists unless ``full``: streams of recordings, labels, files and totals."""
+    if value["kind"] == "recording":
+        return show_recording.to_text(value, full=full)
     if value["kind"] == "recordings":
         return printable.lines(_recordings_text(value, full))
     lines: list[str] = []
-    if value["kind"] == "model":
-        lines = model_overview.model_text(value)
-    elif value["kind"] == "result":
-        lines = model_overview.result_text(value)
+    if value["kind"] == "model" or value["kind"] == "result":
+        lines = model_overview.to_text(value)
     elif value["kind"] == "split":
         lines = _split_text(value)
     origin = f"{value['kind']}, made by {value['stage']} [{value['digest'][:12]}]"
-    lines += [*_rows_lines(value["counted"]), *model_overview.files_text(value["files"], full=full), origin]
+    lines += [*_rows_lines(value["counted"]), *files_text(value["files"], full=full), origin]
     return printable.lines(lines)
 
 
@@ -200,21 +201,9 @@ def _rows_lines(counted: CountedRows) -> list[str]:
 def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
     """Return the lines of an overview of recordings: a table of streams, the labels, excluded recordings, files, totals."""
     listed_names, count = sorted(value["recordings"]), len(value["attributes"])
-    lines = [
-        f"{'recording':<24} {'stream':<10} {'rows':>7} {'columns':>7} {'s':>8} {'Hz':>8} "
-        f"{'gaps':>5} {'held':>5} {'saturated':>9}"
-    ]
-    for name in listed_names:
-        cell = printable.padded(printable.shown(name), 24)
-        for stream, figures in value["recordings"][name].items():
-            repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
-            lines.append(
-                f"{cell} {stream or '-':<10} {figures['rows']:>7} {figures.get('columns', ''):>7} "
-                f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {gaps_text(figures):>5} "
-                f"{repeated:>5} {figures.get('saturated', ''):>9}"
-            )
+    lines = streams_table({name: value["recordings"][name] for name in listed_names}).text().splitlines()
     if count > len(listed_names):
-        lines.append(f"… and {count - len(listed_names)} more (--full)")
+        lines.append(further(count - len(listed_names)))
     every_stream = [figures for name in listed_names for figures in value["recordings"][name].values()]
     if any("rate_hz" in figures for figures in every_stream):
         lines.append(RATES)
@@ -228,7 +217,7 @@ def _recordings_text(value: ShownRecordings, full: bool) -> list[str]:
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
     lines += incomplete
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
-    lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
+    lines += files_text(value["files"], full=full) if value["files"] else []
     lines.append(
         f"{format_count(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "
         f"made by {value['stage']} [{value['digest'][:12]}]"
@@ -240,11 +229,11 @@ def _split_text(value: ShownSplit) -> list[str]:
     """Return lines with the number of recordings per role, one line per fold, and the split's params."""
     existing = {role for counts in value["folds"].values() for role in counts}
     roles = [*(role for role in ROLES if role in existing), *sorted(existing.difference(ROLES))]
-    widths = {role: max(8, len(role) + 2) for role in roles}
-    lines = [f"{'fold':<6}" + "".join(f"{role:>{width}}" for role, width in widths.items())]
-    for fold, counts in value["folds"].items():
-        lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>{width}}" for role, width in widths.items()))
-    return [*lines, f"params: {model_overview.flat(value['params'])}"]
+    rows = [
+        TerminalRow((fold, *(str(counts.get(role, 0)) for role in roles))) for fold, counts in value["folds"].items()
+    ]
+    table = TerminalTable(("fold", *roles), [RowGroup("", rows)])
+    return [*table.text().splitlines(), f"params: {flat(value['params'])}"]
 
 
 class _Values:
@@ -297,11 +286,11 @@ class _Labels:
         """Return one line per label with its values; unless ``full``, a single line for all ground-truth labels."""
         lines = []
         names = sorted(self._values)
-        truth = [name for name in names if name.startswith(_TRUTH)]
+        truth = [name for name in names if name.startswith(TRUTH)]
         if truth and not full:
             names = [name for name in names if name not in truth]
             lines.append(
-                f"{_TRUTH}*: {format_count(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
+                f"{TRUTH}*: {format_count(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
             )
         lines += [f"{label}: {self._values[label]}" for label in names]
         return lines

@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import tacpipe
 from tacpipe.channels import streams
+from tacpipe.channels.schema import TRUTH
 from tacpipe.channels.streams import GAP, gap_shares
+from tacpipe.cli.description import section
 from tacpipe.datasets.intervals import all_intervals
 from tacpipe.errors import UsageError
-from tacpipe.io import JsonObject
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics.headline import format_count
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
+from tacpipe.scores.words import format_count
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Dataset
     from tacpipe.io.columns import Columns
     from tacpipe.traces.spans import Span
 
@@ -60,8 +59,7 @@ class StreamFigures(TypedDict, total=False):
     damaged_frames: int
 
 
-@dataclass(frozen=True)
-class StreamColumn:
+class StreamColumn(TypedDict):
     """A column and its stream."""
 
     stream: str
@@ -71,8 +69,7 @@ class StreamColumn:
     type: str
 
 
-@dataclass(frozen=True)
-class ShownInterval:
+class ShownInterval(TypedDict):
     """A gap of a stream, or an interval with a constant row label; in seconds since the start of the recording."""
 
     name: str  # name of the stream or label
@@ -81,8 +78,7 @@ class ShownInterval:
     stop_s: float
 
 
-@dataclass(frozen=True)
-class RecordedEvent:
+class RecordedEvent(TypedDict):
     """A recorded event, in seconds since the start of the recording."""
 
     time_s: float
@@ -90,10 +86,10 @@ class RecordedEvent:
     text: str
 
 
-@dataclass(frozen=True)
-class RecordingOverview:
+class RecordingOverview(TypedDict):
     """Contents of one recording."""
 
+    kind: Literal["recording"]
     name: str
     stage: str
     digest: str
@@ -107,10 +103,6 @@ class RecordingOverview:
     events: Sequence[RecordedEvent]
     attributes: Mapping[str, Attribute]
 
-    def to_json(self) -> JsonObject:
-        """Return the overview as plain values."""
-        return {"kind": "recording", **dataclasses.asdict(self)}
-
 
 def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
     """Plot the named recording, or the only one, and return the path of the picture.
@@ -119,7 +111,7 @@ def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
     """
     from tacpipe.viewer import contents, figure
 
-    opened = _open(dataset)
+    opened = tacpipe.open(dataset)
     if recording is None and len(opened) != 1:
         raise UsageError(
             f"{dataset} has {len(opened)} recordings, and --plot draws one; name it: {listed(opened.recordings, _NAMED)}."
@@ -133,7 +125,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
     """Return the overview of a recording. Raises `UsageError` if the dataset has no recording of this name."""
     from tacpipe.traces import spans
 
-    opened = _open(dataset)
+    opened = tacpipe.open(dataset)
     recording = opened[name]
     figures: dict[str, StreamFigures] = {}
     columns: list[StreamColumn] = []
@@ -150,7 +142,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
         clocks.append(stream_clocks)
         ends = zip(stream_clocks.gap_starts_ns.tolist(), stream_clocks.gap_stops_ns.tolist(), strict=True)
         gaps += [spans.Span(stream or "rows", "gap", *stamps) for stamps in ends]
-        quantities = {column.name: column.quantity for column in _columns(stream, stored.schema)}
+        quantities = {column["name"]: column["quantity"] for column in _columns(stream, stored.schema)}
         gaps += spans.masked_gaps(_select(stored, [name for name in quantities if name.endswith(GAP)]))
         if stream != streams.EVENTS:
             label_spans += spans.label_spans(
@@ -161,24 +153,24 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
     origin_ns = start_ns or 0
     for label, labelled in all_intervals(recording.attributes).items():
         label_spans += spans.interval_spans(label, labelled, origin_ns)
-    return RecordingOverview(
-        name,
-        opened.source.stage,
-        recording.digest,
-        sum(recording.sizes.values()),
-        start_ns,
-        (max(stream_clocks.stop_ns for stream_clocks in clocks) - origin_ns) / 1e9 if clocks else None,
-        figures,
-        columns,
-        _intervals(gaps, origin_ns),
-        _intervals(label_spans, origin_ns),
-        [RecordedEvent((event.t_ns - origin_ns) / 1e9, event.stream, event.text) for event in events],
-        dict(recording.attributes),
-    )
-
-
-def _open(dataset: Path) -> Dataset:
-    return tacpipe.open(dataset)
+    stop_ns = max((stream_clocks.stop_ns for stream_clocks in clocks), default=None)
+    return {
+        "kind": "recording",
+        "name": name,
+        "stage": opened.source.stage,
+        "digest": recording.digest,
+        "bytes": sum(recording.sizes.values()),
+        "start_ns": start_ns,
+        "duration_s": None if stop_ns is None else (stop_ns - origin_ns) / 1e9,
+        "streams": figures,
+        "columns": columns,
+        "gaps": _intervals(gaps, origin_ns),
+        "label_spans": _intervals(label_spans, origin_ns),
+        "events": [
+            {"time_s": (event.t_ns - origin_ns) / 1e9, "stream": event.stream, "text": event.text} for event in events
+        ],
+        "attributes": dict(recording.attributes),
+    }
 
 
 def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
@@ -187,13 +179,13 @@ def _columns(stream: str, schema: pa.Schema) -> list[StreamColumn]:
 
     about = {field.name: field_metadata(field) for field in schema}
     return [
-        StreamColumn(
-            stream or about[field.name].get("stream", ""),
-            field.name,
-            about[field.name].get("quantity", ""),
-            about[field.name].get("unit", ""),
-            str(field.type),
-        )
+        {
+            "stream": stream or about[field.name].get("stream", ""),
+            "name": field.name,
+            "quantity": about[field.name].get("quantity", ""),
+            "unit": about[field.name].get("unit", ""),
+            "type": str(field.type),
+        }
         for field in schema
     ]
 
@@ -209,7 +201,12 @@ def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
 
 def _intervals(marked: Sequence[Span], origin_ns: int) -> list[ShownInterval]:
     return [
-        ShownInterval(span.lane, span.text, (span.start_ns - origin_ns) / 1e9, (span.stop_ns - origin_ns) / 1e9)
+        {
+            "name": span.lane,
+            "text": span.text,
+            "start_s": (span.start_ns - origin_ns) / 1e9,
+            "stop_s": (span.stop_ns - origin_ns) / 1e9,
+        }
         for span in marked
     ]
 
@@ -290,41 +287,52 @@ def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
 
     Lists are cut off unless ``full``.
     """
-    rows = sum(figures["rows"] for figures in recording.streams.values())
-    head = [shown(recording.name)]
-    if recording.duration_s is not None:
-        head.append(f"{recording.duration_s:.3f} s")
-    if recording.start_ns is not None and recording.start_ns > WALL_CLOCK_NS:
-        head.append(f"from {datetime.fromtimestamp(recording.start_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC")
-    head.append(f"{rows:,} rows, {recording.bytes / 1e6:.1f} MB, made by {recording.stage} [{recording.digest[:12]}]")
+    rows = sum(figures["rows"] for figures in recording["streams"].values())
+    head = [shown(recording["name"])]
+    if recording["duration_s"] is not None:
+        head.append(f"{recording['duration_s']:.3f} s")
+    if recording["start_ns"] is not None and recording["start_ns"] > WALL_CLOCK_NS:
+        head.append(f"from {datetime.fromtimestamp(recording['start_ns'] // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC")
+    head.append(
+        f"{rows:,} rows, {recording['bytes'] / 1e6:.1f} MB, made by {recording['stage']} [{recording['digest'][:12]}]"
+    )
     sections = [
         ", ".join(head),
         _streams_text(recording),
-        _videos_text(recording.streams),
-        _columns_table(recording.columns, full).text(),
+        _videos_text(recording["streams"]),
+        _columns_table(recording["columns"], full).text(),
         _gaps_text(recording, full),
-        _intervals_text(recording.label_spans, full),
-        _events_text(recording.events, full),
-        _attributes_text(recording.attributes, full),
+        _intervals_text(recording["label_spans"], full),
+        _events_text(recording["events"], full),
+        _attributes_text(recording["attributes"], full),
     ]
     return "\n\n".join(section for section in sections if section)
 
 
+def streams_table(recordings: Mapping[str, Mapping[str, StreamFigures]], *, alone: bool = False) -> TerminalTable:
+    """Return a table with the figures of each stream by recording; of one ``alone`` without its name, with mean rates."""
+    heads = ("recording", "stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
+    left_out = 0 if alone else heads.index("mean Hz")
+    rows = []
+    for recording, streams_of_recording in recordings.items():
+        for stream, figures in streams_of_recording.items():
+            repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
+            values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz")]
+            numbers = ["" if value is None else f"{value:,}" for value in values]
+            last = (gaps_text(figures), repeated, str(figures.get("saturated", "")))
+            rows.append((shown(recording), shown(stream) or "-", *numbers, *last))
+    shown_heads, *shown_rows = ((*row[:left_out], *row[left_out + 1 :]) for row in (heads, *rows))
+    group = RowGroup("", [TerminalRow(row) for row in shown_rows])
+    return TerminalTable(shown_heads, [group], left=(0,) if alone else (0, 1))
+
+
 def _streams_text(recording: RecordingOverview) -> str:
     """Return a table with the figures of each stream, and what they mean."""
-    heads = ("stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
-    rows = []
-    for stream, figures in recording.streams.items():
-        repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
-        values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz")]
-        cells = ["" if value is None else f"{value:,}" for value in values]
-        rows.append(
-            TerminalRow((shown(stream) or "-", *cells, gaps_text(figures), repeated, str(figures.get("saturated", ""))))
-        )
-    notes = [RATES, _MEAN_RATES] if recording.start_ns is not None else []
-    if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
+    notes = [RATES, _MEAN_RATES] if recording["start_ns"] is not None else []
+    if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording["streams"].values()):
         notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")
-    return TerminalTable(heads, [RowGroup("", rows)], caption=" ".join(notes)).text()
+    table = streams_table({recording["name"]: recording["streams"]}, alone=True)
+    return dataclasses.replace(table, caption=" ".join(notes)).text()
 
 
 def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
@@ -340,19 +348,19 @@ def _videos_text(streams_figures: Mapping[str, StreamFigures]) -> str:
         parts.append("missing frames unknown" if missing is None else f"{format_count(missing, 'missing frames')}")
         if damaged := figures.get("damaged_frames"):
             parts.append(f"{format_count(damaged, 'damaged frames')}")
-        lines.append(f"  {shown(stream) or '-'}: {', '.join(parts)}")
-    return "\n".join(["video", *lines]) if lines else ""
+        lines.append(f"{shown(stream) or '-'}: {', '.join(parts)}")
+    return section("video", lines)
 
 
 def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable:
     """Return a table of columns by stream; adjacent columns that differ only in name share a row, unless ``full``."""
     groups = []
-    for stream, members in groupby(columns, lambda column: column.stream):
+    for stream, members in groupby(columns, lambda column: column["stream"]):
         rows = []
         for about, similar in groupby(
-            members, lambda column: (column.quantity, column.unit, column.type, full and column.name)
+            members, lambda column: (column["quantity"], column["unit"], column["type"], full and column["name"])
         ):
-            names = [shown(column.name) for column in similar]
+            names = [shown(column["name"]) for column in similar]
             text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
             rows.append(TerminalRow((text, str(len(names)), *(shown(value) for value in about[:3]))))
         groups.append(RowGroup(shown(stream) or "-", rows))
@@ -362,38 +370,36 @@ def _columns_table(columns: Sequence[StreamColumn], full: bool) -> TerminalTable
 def _gaps_text(recording: RecordingOverview, full: bool) -> str:
     """Return one line per stream with gaps: number of gaps, total duration, and the longest gaps; "" without gaps."""
     lines = []
-    for stream in sorted({gap.name for gap in recording.gaps}):
+    for stream in sorted({gap["name"] for gap in recording["gaps"]}):
         longest = sorted(
-            (gap for gap in recording.gaps if gap.name == stream),
-            key=lambda gap: (gap.start_s - gap.stop_s, gap.start_s),
+            (gap for gap in recording["gaps"] if gap["name"] == stream),
+            key=lambda gap: (gap["start_s"] - gap["stop_s"], gap["start_s"]),
         )
-        total_s = sum(gap.stop_s - gap.start_s for gap in longest)
-        share = f" ({total_s / recording.duration_s:.1%})" if recording.duration_s else ""
-        details = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
+        total_s = sum(gap["stop_s"] - gap["start_s"] for gap in longest)
+        share = f" ({total_s / recording['duration_s']:.1%})" if recording["duration_s"] else ""
+        details = [f"{gap['stop_s'] - gap['start_s']:.3f} s at {gap['start_s']:.3f} s" for gap in longest]
         lines.append(
             f"{plain(stream)}: {format_count(len(details), 'gaps')}, {total_s:.3f} s{share}: {_list_first(details, full)}"
         )
-    return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
+    return section("gaps, the longest first", lines)
 
 
 def _intervals_text(label_spans: Sequence[ShownInterval], full: bool) -> str:
     """Return a heading and one line per label of rows with its intervals, or "" if there are no such labels."""
     lines = []
-    for label in dict.fromkeys(span.name for span in label_spans):
+    for label in dict.fromkeys(span["name"] for span in label_spans):
         interval_texts = [
-            f"{span.text if span.text != label else ''} {span.start_s:.3f} to {span.stop_s:.3f} s".strip()
+            f"{span['text'] if span['text'] != label else ''} {span['start_s']:.3f} to {span['stop_s']:.3f} s".strip()
             for span in label_spans
-            if span.name == label
+            if span["name"] == label
         ]
-        lines.append(f"{label}: {_list_first(interval_texts, full)}")
-    return "\n".join(["labels of rows", *(f"  {shown(line)}" for line in lines)]) if lines else ""
+        lines.append(shown(f"{label}: {_list_first(interval_texts, full)}"))
+    return section("labels of rows", lines)
 
 
 def _events_text(events: Sequence[RecordedEvent], full: bool) -> str:
-    lines = [f"  {event.time_s:.3f} s  {shown(f'{event.stream}: {event.text}')}" for event in events]
-    retained = lines if full else lines[:_LISTED]
-    ending = [f"  … and {len(lines) - len(retained)} more (--full)"] if len(lines) > len(retained) else []
-    return "\n".join(["events", *retained, *ending]) if lines else ""
+    lines = [f"{event['time_s']:.3f} s  {shown(event['stream'])}: {shown(event['text'])}" for event in events]
+    return section("events", lines if full else lines[:_LISTED], len(lines))
 
 
 def _list_first(texts: Sequence[str], full: bool) -> str:
@@ -406,7 +412,6 @@ def _list_first(texts: Sequence[str], full: bool) -> str:
 def _attributes_text(attributes: Mapping[str, Attribute], full: bool) -> str:
     """Return one line per label of the recording, without ground truth and only the first ones unless ``full``."""
     names = sorted(attributes)
-    listed_names = names if full else [name for name in names if not name.startswith(streams.TRUTH)][:_LABELS]
-    lines = [f"  {shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]
-    ending = [f"  … and {len(names) - len(lines)} more (--full)"] if len(names) > len(lines) else []
-    return "\n".join(["labels", *lines, *ending]) if names else ""
+    listed_names = names if full else [name for name in names if not name.startswith(TRUTH)][:_LABELS]
+    lines = [f"{shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]
+    return section("labels", lines, len(names))

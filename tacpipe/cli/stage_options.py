@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -16,22 +17,31 @@ from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.fields import Annotation
-from tacpipe.plugins.stage import AnyStage, Requirements
+from tacpipe.plugins.requirements import Requirements
+from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import Device
 
 PRINT_PARAMS = "--print-params"
 EXAMPLE = "Example: "  # start of the last paragraph of a stage's docstring
 
 
-def of(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
-    """Return the parameters of a stage's command; ``fields`` are the fields of its params by name."""
-    return [*_arguments(stage), *_shared_parameters(stage), *_options(stage, fields), *_looks(stage)]
+def of(name: str, stage: AnyStage, fields: Mapping[str, Annotation], words: Sequence[str]) -> list[inspect.Parameter]:
+    """Return the parameters of the command of stage ``name``; ``fields`` are the fields of its params by name.
+
+    ``words`` are those of the command line. They determine which help is shown.
+    """
+    return [
+        *_arguments(stage, words),
+        *_shared_parameters(stage),
+        *_options(stage, fields, words),
+        *_looks(name, stage),
+    ]
 
 
-def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
+def _arguments(stage: AnyStage, words: Sequence[str]) -> list[inspect.Parameter]:
     """Return the positional arguments of a stage's command: source, model and datasets, as far as the stage reads them."""
     kinds = set(stage.arguments.values())
-    default = None if PRINT_PARAMS in sys.argv else ...  # Printing params requires no data.
+    default = None if PRINT_PARAMS in words else ...  # Printing params requires no data.
     arguments: list[tuple[str, Any, str]] = []
     if "Files" in kinds:
         arguments.append(("source", Path, "Folder of the recordings."))
@@ -91,11 +101,11 @@ def _shared_parameters(stage: AnyStage) -> list[inspect.Parameter]:
     return parameters
 
 
-def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.Parameter]:
+def _options(stage: AnyStage, fields: Mapping[str, Annotation], words: Sequence[str]) -> list[inspect.Parameter]:
     """Return an option for each param of a stage, and the options of params files, execution and printing."""
-    helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
+    helps = params_of.comments(stage) if {"--help", "-h"} & set(words) else {}
     panels = params_of.panels(stage)
-    choice = _shown_choice(stage)
+    choice = _shown_choice(stage, words)
     parameters = []
     for name, hint in fields.items():
         kind = fields_of.bare(hint)
@@ -176,19 +186,19 @@ def _options(stage: AnyStage, fields: Mapping[str, Annotation]) -> list[inspect.
     return [*parameters, *(_parameter(*item) for item in common_options)]
 
 
-def _looks(stage: AnyStage) -> list[inspect.Parameter]:
+def _looks(name: str, stage: AnyStage) -> list[inspect.Parameter]:
     """Return the options that print information instead of running the stage."""
     parameters = []
-    if stage.guess is not None:
+    if stage.source is not None and stage.source.guess is not None:
         text = "Print a first layout file for this folder, and stop."
         parameters.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
-    if stage.preview is not None:
+    if stage.source is not None and stage.source.preview is not None:
         text = "Describe the recordings, and stop."
         parameters.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
-    if stage.requirements is not None:
+    if (requirements := registry.requirements(name)) is not None:
         text = "Print the required channels and labels, and stop."
         show = typer.Option(
-            False, "--requirements", help=text, is_eager=True, callback=_requirements_callback(stage.requirements)
+            False, "--requirements", help=text, is_eager=True, callback=_requirements_callback(requirements)
         )
         parameters.append(_parameter("requirements", bool, show))
     return parameters
@@ -205,12 +215,12 @@ def _requirements_callback(requirements: Requirements) -> Callable[[bool], None]
     return show
 
 
-def _shown_choice(stage: AnyStage) -> str | None:
+def _shown_choice(stage: AnyStage, words: Sequence[str]) -> str | None:
     """Return the architecture (or other kind of params) whose options the help shows; None if a stage has only one kind."""
     tag = params_of.tag(stage)
     if tag is None:
         return None
-    for word, next_word in zip(sys.argv, [*sys.argv[1:], ""], strict=True):
+    for word, next_word in itertools.pairwise([*words, ""]):
         if word == f"--{tag}":
             return next_word
         if word.startswith(f"--{tag}="):

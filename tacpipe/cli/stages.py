@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -27,45 +25,29 @@ from tacpipe.training import devices
 if TYPE_CHECKING:
     from tacpipe.engine.outcome import Outcome
 
-_answering: ContextVar[bool] = ContextVar("answering", default=False)
-
-
-class UnansweredError(Exception):
-    """Raised if a command has something to compute or write, or always has an effect."""
-
-
-@contextlib.contextmanager
-def answering() -> Iterator[None]:
-    """Make stage commands in the context report only stored results, and raise `UnansweredError` if there are none."""
-    token = _answering.set(True)
-    try:
-        yield
-    finally:
-        _answering.reset(token)
-
 
 def add_group(program: typer.Typer, group: str, arguments: Sequence[str]) -> None:
     """Add the command ``group`` to ``program``: a stage, or a group with the stages that ``arguments`` name."""
     names = [name for name in registry.stages() if name.partition(".")[0] == group]
     if names == [group]:
-        add(program, group, group)
+        add(program, group, group, arguments)
         return
     group_help = registry.group_help(group) or registry.commands()[group]
     methods = typer.Typer(help=group_help, no_args_is_help=True, rich_markup_mode=None)
     by_method = {name.partition(".")[2]: name for name in names}
     requested = [method for method in by_method if method in arguments]
     for method in requested:  # A broken method must not affect the other methods.
-        add(methods, by_method[method], method)
+        add(methods, by_method[method], method, arguments)
     for method in () if requested else by_method:
         methods.command(method, help=registry.summary(by_method[method]))(unrequested)
     program.add_typer(methods, name=group)
 
 
-def add(program: typer.Typer, name: str, command: str) -> None:
-    """Add stage ``name`` to ``program`` as ``command``, with options for its params."""
+def add(program: typer.Typer, name: str, command: str, words: Sequence[str]) -> None:
+    """Add stage ``name`` to ``program`` as ``command``, with options for its params; ``words`` are the command line's."""
     stage = registry.load(name)
     fields = params_of.fields(stage)
-    parameters = stage_options.of(stage, fields)
+    parameters = stage_options.of(name, stage, fields, words)
 
     def call(**options: Any) -> None:
         _call(name, stage, options, [field for field in fields if options.get(field) is not None])
@@ -78,19 +60,15 @@ def add(program: typer.Typer, name: str, command: str) -> None:
 def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequence[str]) -> None:
     """Run a stage with the options of its command: print information, or compute one or several folds and report them.
 
-    Raises `UnansweredError` while only stored results are reported and there are none, and `UsageError` for wrong
-    options.
+    Raises `UsageError` for wrong options.
     """
-    answering = _answering.get()
-    if answering and any(options.get(flag) for flag in ("guess", "print_params", "dry_run")):
-        raise UnansweredError
     terminal.set_quiet(options["quiet"])
     for flag, kind in OPTIONS.items():
         if flag != "fold" and options.get(flag) is not None:  # Not all stages have all of these options.
             fields_of.check(options[flag], kind, f"--{flag}")
-    if options.get("guess") and stage.guess is not None:
+    if options.get("guess") and stage.source is not None and stage.source.guess is not None:
         with failures.naming_source([options["source"]]):
-            layout = stage.guess(options["source"])
+            layout = stage.source.guess(options["source"])
         terminal.result(layout.rstrip("\n"))
         return
     params = given_params.build(
@@ -105,9 +83,9 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
     if options["print_params"]:
         terminal.result(json.dumps(params_of.to_input(params), indent=1))
         return
-    if options.get("dry_run") and stage.preview is not None:
+    if options.get("dry_run") and stage.source is not None and stage.source.preview is not None:
         with failures.naming_source([options["source"]]):
-            description = stage.preview(params, options["source"])
+            description = stage.source.preview(params, options["source"])
         terminal.result(description)
         return
     if options["output"] is None:
@@ -118,9 +96,7 @@ def _call(name: str, stage: AnyStage, options: dict[str, Any], param_names: Sequ
     # Checks and comparisons write nothing.
     headline_file = stage.headline if not (options["check"] or options["compare"]) else None
     report_options = {"as_json": options["json_"], "quiet": options["quiet"]}
-    if answering:
-        _report_answers(requests, headline_file, **report_options)
-    elif len(requests) == 1:
+    if len(requests) == 1:
         _report(pipeline.run(requests[0]), headline_file, **report_options)
     else:
         if stage.trains and not (options["quiet"] or options["check"] or options["compare"]):
@@ -146,17 +122,6 @@ def _request(name: str, stage: AnyStage, params: Any, options: Mapping[str, Any]
         replace=options["replace"],
         track=tuple(options.get("track") or ()),
     ).with_paths({key: options.get(key) for key in PATHS})
-
-
-def _report_answers(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Report stored results. Raises `UnansweredError` if a result is missing."""
-    from tacpipe.engine import pipeline
-
-    outcomes = [outcome for request in requests if (outcome := pipeline.existing_outcome(request)) is not None]
-    if len(outcomes) < len(requests):
-        raise UnansweredError
-    for outcome in outcomes:
-        _report(outcome, headline, as_json=as_json, quiet=quiet)
 
 
 def _print_estimate(requests: Sequence[Request]) -> None:
@@ -199,7 +164,7 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         headlines = headline_table.of_output(outcome.output, headline)
         headlines_json = [entry.to_json() for entry in headlines or ()]
         if not quiet and headlines is not None:  # Tasks from other packages may have no headline.
-            headline_table.show(headlines)
+            headline_table.show(headlines, outcome.output)
     if as_json:
         extra = {} if headlines_json is None else {"headline": headlines_json}
         terminal.result_json({"schema_version": 1, **outcome.to_json(), **extra})

@@ -12,6 +12,7 @@ import typer
 from tacpipe.errors import DAMAGED, FAILED, UsageError
 from tacpipe.io import terminal
 from tacpipe.maintenance import garbage
+from tacpipe.maintenance import repair as upkeep
 from tacpipe.printable import plain
 from tacpipe.store import layout
 from tacpipe.store.location import locate
@@ -19,8 +20,8 @@ from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
-    from tacpipe.maintenance.pushed import AnyStore
     from tacpipe.maintenance.repair import Soundness
+    from tacpipe.store.remote import AnyStore
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Paths = Annotated[list[Path], typer.Argument(help="Datasets.")]
@@ -80,17 +81,10 @@ def status(as_json: AsJson = False) -> None:
 
     Example: tacpipe store status
     """
-    from tacpipe.maintenance import repair as upkeep
+    from tacpipe.maintenance import status as statuses
 
-    store = locate()
-    if store.distant:
-        from tacpipe.maintenance import cache
-
-        bucket_status = cache.status(cache.distant(store))
-        _print(bucket_status, as_json=as_json, text=cache.status_text(bucket_status))
-        return
-    status = upkeep.status(store)
-    _print(status, as_json=as_json, text=upkeep.status_text(status))
+    status = statuses.status(locate())
+    _print(status, as_json=as_json, text=statuses.status_text(status))
 
 
 def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
@@ -100,12 +94,11 @@ def list_(store: OtherStore = None, as_json: AsJson = False) -> None:
 
     Example: tacpipe store list
     """
-    from tacpipe.maintenance import cache, transfer
     from tacpipe.maintenance import checkout as checkouts
+    from tacpipe.maintenance import transfer
+    from tacpipe.store.cached import bucket_or_folder
 
-    listed = checkouts.list_manifests(
-        cache.bucket_or_folder(locate()) if store is None else transfer.remote_store(store)
-    )
+    listed = checkouts.list_manifests(bucket_or_folder(locate()) if store is None else transfer.remote_store(store))
     value = {"schema_version": 1, "manifests": [asdict(entry) for entry in listed]}
     _print(value, as_json=as_json, text=checkouts.to_text(listed))
 
@@ -145,14 +138,10 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
 
     Example: tacpipe store verify --remote s3://lab/store
     """
-    from tacpipe.maintenance import cache, remote_upkeep, transfer
-    from tacpipe.maintenance import repair as upkeep
+    from tacpipe.maintenance import transfer
 
     store = locate() if remote is None else transfer.remote_store(remote)
-    if isinstance(store, Store) and store.distant:
-        soundness = cache.verify(cache.distant(store))
-    else:
-        soundness = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
+    soundness = upkeep.verify(store)
     _print(asdict(soundness), as_json=as_json, text=soundness.to_text(changed=isinstance(store, Store)))
     if soundness.damaged or soundness.missing or soundness.lost:
         raise typer.Exit(DAMAGED)
@@ -166,11 +155,7 @@ def repair(as_json: AsJson = False) -> None:
 
     Example: tacpipe store repair
     """
-    from tacpipe.maintenance import cache
-    from tacpipe.maintenance import repair as upkeep
-
-    store = locate()
-    soundness = cache.repair_damaged(cache.distant(store)) if store.distant else upkeep.repair(store)
+    soundness = upkeep.repair(locate())
     _print(asdict(soundness), as_json=as_json, text=soundness.to_text())
     if soundness.lost:
         raise typer.Exit(DAMAGED)
@@ -205,19 +190,20 @@ def gc(
 
     Example: tacpipe store gc --dry-run
     """
-    from tacpipe.maintenance import remote_upkeep, transfer
+    from tacpipe.maintenance import cache as caches
+    from tacpipe.maintenance import transfer
+    from tacpipe.store.cached import bucket_or_folder
 
     if not 0 <= grace_days < math.inf:  # NaN also fails this check.
         raise UsageError(f"--grace-days is {grace_days:g}; it must be a number of days of 0 or more.")
     store = locate() if remote is None else transfer.remote_store(remote)
-    if isinstance(store, Store) and store.distant:
-        collected = _collect_distant(store, forget or [], dry_run, recordings, grace_days, cache=cache)
-    elif cache:
-        raise UsageError(f"--cache is for a store in a bucket, and {store.place} has no folder in front of it.")
+    if cache:
+        if forget or recordings:
+            raise UsageError("--cache removes copies only. Give --forget and --recordings without it.")
+        collected = caches.clear(store, dry_run=dry_run)
     else:
-        _forget(store, forget or [], dry_run=dry_run)
-        collect = garbage.collect if isinstance(store, Store) else remote_upkeep.collect
-        collected = collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)  # type: ignore[arg-type]
+        _forget(bucket_or_folder(store), forget or [], dry_run=dry_run)
+        collected = garbage.collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
     verb = "would remove" if dry_run else "removed"
     text = (
         f"{verb} {collected.objects} objects ({collected.bytes / 1e6:.1f} MB), {collected.records} records, "
@@ -228,24 +214,6 @@ def gc(
             f"; kept {collected.kept_recordings} streams of recordings that nothing names (--recordings removes them)"
         )
     _print(asdict(collected), as_json=as_json, text=text)
-
-
-def _collect_distant(
-    store: Store, forget: list[str], dry_run: bool, recordings: bool, grace_days: float, *, cache: bool
-) -> garbage.Collected:
-    """Remove what is not needed in a bucket, or with ``cache`` only local copies.
-
-    Raises `UsageError` for other options then.
-    """
-    from tacpipe.maintenance import cache as caches
-
-    distant = caches.distant(store)
-    if cache:
-        if forget or recordings:
-            raise UsageError("--cache removes copies only. Give --forget and --recordings without it.")
-        return caches.clear(distant, dry_run=dry_run)
-    _forget(distant.bucket, forget, dry_run=dry_run)
-    return caches.collect(distant, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
 def _forget(store: AnyStore, names: list[str], *, dry_run: bool) -> None:
@@ -272,8 +240,6 @@ def link(datasets: Paths) -> None:
 
     Example: tacpipe store link data/synced
     """
-    from tacpipe.maintenance import repair as upkeep
-
     for path in datasets:
         count = upkeep.link(path)
         terminal.result(f"{path}: {count} linked again")

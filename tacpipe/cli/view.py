@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import tacpipe
+from tacpipe.datasets import labels, replacing
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import terminal
+from tacpipe.io.files import readable_errors, write_whole
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 
@@ -97,8 +99,6 @@ def view(
 
 def _require(save: Path | None, *, web: bool, port: int | None) -> None:
     """Raise `UsageError` before reading data if options conflict or a file belongs to another program."""
-    from tacpipe.datasets import replacing
-
     if save is not None and web:
         raise UsageError("--save and --web contradict each other. Give only one.")
     if port is not None and not web:
@@ -117,8 +117,6 @@ def conditions(where: Sequence[str]) -> dict[str, Attribute]:
     >>> conditions(["object=cup", "trial=3"])
     {'object': 'cup', 'trial': 3}
     """
-    from tacpipe.datasets import labels
-
     conditions_by_name = {}
     for text in where:
         name, equals, value = text.partition("=")
@@ -191,9 +189,6 @@ def _save(files: Sequence[Path], save: Path) -> None:
 
     Raises `UsageError` for files of other programs.
     """
-    from tacpipe.datasets import replacing
-    from tacpipe.io.files import readable_errors, write_whole
-
     paths = [save] if save.suffix.lower() == ENDING else [save / file.name for file in files]
     for path in paths:
         replacing.refuse_foreign(path, MAGIC)

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.channels.schema import field_metadata
+from tacpipe.channels.streams import columns_of_schema
 from tacpipe.channels.streams import times as times
 from tacpipe.codecs import codec as codecs
 from tacpipe.datasets.dataset import Recording
@@ -23,8 +24,8 @@ LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes the positi
 
 
 def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
-    """Return the names of the columns with this ``quantity`` in their metadata, in the order of the table."""
-    return tuple(field.name for field in schema if field_metadata(field).get("quantity") == quantity)
+    """Return the names of the columns with this ``quantity``, in the order of the table, without ground truth."""
+    return tuple(columns_of_schema(schema, quantity))
 
 
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:

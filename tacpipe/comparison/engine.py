@@ -1,13 +1,13 @@
 """Compare methods with each other and with their baselines: errors, gain over the best baseline, and intervals.
 
 Runs of a method are pooled: its errors are summed by seed and recording. Intervals are over clusters of recordings, and over
-seeds where there are several (`tacpipe.metrics.pairing`).
+seeds where there are several (`tacpipe.scores.pairing`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,17 +18,17 @@ from tacpipe.comparison.runs import (
     Method,
     Question,
     Settings,
-    TaskReport,
+    TaskResults,
     by_task,
     grouped,
     report_on,
     separate,
     spread,
 )
-from tacpipe.metrics import pairing
-from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.intervals import Estimate, paired_t
-from tacpipe.metrics.pairing import Gain, Measure, Pair, Sums
+from tacpipe.scores import pairing
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.intervals import Estimate
+from tacpipe.scores.pairing import Gain, Measure, Pair, Sums
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,13 +135,13 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
     """
     all_comparisons = []
     for name, same in by_task(results).items():
-        task = report_on(name)
+        task = report_on(name, TaskResults)
         runs = task.read(same)
         all_comparisons += comparisons(task, grouped(runs, task.usual) if pool else separate(runs))
     return all_comparisons
 
 
-def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]:
+def comparisons(task: TaskResults, methods: Sequence[Method]) -> list[Comparison]:
     """Return one comparison per question and unit of its errors, with questions in the order of the runs."""
     all_comparisons = []
     for question in questions_of([run for method in methods for run in method.runs]):
@@ -167,7 +167,7 @@ def questions_of(runs: Sequence[ComparedRun]) -> list[Question]:
     )
 
 
-def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) -> Comparison:
+def compare_on(task: TaskResults, methods: Sequence[Method], question: Question) -> Comparison:
     """Return the comparison of methods on one question.
 
     Models and their variants are rows for each method. Other predictors, such as baselines and oracles, are the same for
@@ -191,12 +191,7 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
             elif method is sources[predictor]:
                 entries.append((task.predictor_name(predictor), kind, predictor, method))
     ranked = [_rank_baselines(task, method, source, question, predictor) for _, _, predictor, method in entries]
-    model_pairs = [
-        next(iter(pairs.values()))
-        for (_, kind, _, _), pairs in zip(entries, ranked, strict=True)
-        if kind == "model" and pairs
-    ]
-    rows = [_row(*entry, question, measure, pairs, model_pairs) for entry, pairs in zip(entries, ranked, strict=True)]
+    rows = [_row(*entry, question, measure, pairs) for entry, pairs in zip(entries, ranked, strict=True)]
     sign = -1 if measure.rises else 1
 
     def best_first(row: ComparisonRow) -> tuple[bool, float, str]:
@@ -205,7 +200,7 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
     return Comparison(task.name, question, measure, tuple(sorted(rows, key=best_first)))
 
 
-def reference(task: TaskReport, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
+def reference(task: TaskResults, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
     """Return the method whose baselines are reported: the one with most baselines, then most runs, then the lowest error."""
 
     def rank(method: Method) -> tuple[int, int, float]:
@@ -217,12 +212,17 @@ def reference(task: TaskReport, methods: Sequence[Method], question: Question, m
 
 
 def headline(row: ComparisonRow, comparison: Comparison) -> Headline | None:
-    """Return a method's row as a headline, with all baselines that it was compared with; None without recordings."""
+    """Return a method's row as a headline, with all baselines that it was compared with; None without recordings.
+
+    For the best method, the interval accounts for its choice from all methods.
+    """
     question, method = comparison.question, row.method
     source = next((row.method for row in comparison.rows if row.kind == "baseline"), method)
-    task = report_on(comparison.task)
+    task = report_on(comparison.task, TaskResults)
     rivals = (
-        [row_of_model for row_of_model in comparison.models if row_of_model is not row] if row.kind == "model" else []
+        [row_of_model for row_of_model in comparison.models if row_of_model is not row]
+        if row is comparison.best
+        else []
     )
     ranked = [_rank_baselines(task, rival.method, source, question, rival.predictor) for rival in rivals]
     return pairing.headline(
@@ -247,7 +247,7 @@ def difference(first: Method, second: Method, question: Question, predictors: tu
 
 
 def _rank_baselines(
-    task: TaskReport, method: Method, source: Method, question: Question, predictor: str
+    task: TaskResults, method: Method, source: Method, question: Question, predictor: str
 ) -> dict[str, Pair]:
     """Return a predictor of a method paired with each baseline, the best baseline first.
 
@@ -267,16 +267,15 @@ def _row(
     question: Question,
     measure: Measure,
     pairs: Mapping[str, Pair],
-    model_pairs: Sequence[Pair],
 ) -> ComparisonRow:
     """Return the row of a predictor. ``pairs`` are its pairs with its baselines by name, the best baseline first.
 
-    ``model_pairs`` are the pairs of all models with their best baselines, from which a model may have been selected.
+    The gain is that of the method alone, as its own result states it; `headline` accounts for the choice of the best.
     """
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
     run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
-    gain = pairing.gain(measure, list(pairs.values()), model_pairs if kind == "model" else ())
+    gain = pairing.gain(measure, list(pairs.values()))
     return ComparisonRow(
         name,
         kind,
@@ -288,7 +287,7 @@ def _row(
         spread(run_scores).sd,
         next(iter(pairs), ""),
         gain,
-        next((compared.p(measure) for compared in pairs.values()), math.nan),
+        next((compared.p for compared in pairs.values()), math.nan),
         gain.clusters or len({clusters[name] if clusters else name for _, name in sums}),
         len({recording for _, recording in sums}),
         len(runs),
@@ -296,7 +295,7 @@ def _row(
     )
 
 
-def _baselines(task: TaskReport, method: Method, source: Method, question: Question) -> dict[str, Sums]:
+def _baselines(task: TaskResults, method: Method, source: Method, question: Question) -> dict[str, Sums]:
     """Return the baselines of a method's own runs, or else of ``source``, by their names in tables."""
     baselines = {}
     for name in dict.fromkeys([*method.predictors(question), *source.predictors(question)]):
@@ -310,65 +309,3 @@ def _clusters(method: Method, question: Question) -> dict[str, str] | None:
     if any(clusters is None for clusters in clusters_by_run):
         return None
     return {name: cluster for clusters in clusters_by_run if clusters for name, cluster in clusters.items()}
-
-
-ABOUT = ("run", "seed", "fold", "tested", "recording")  # columns of a table of observations
-
-
-@dataclass(frozen=True)
-class PairedRuns:
-    """Two methods compared over repeated runs."""
-
-    unit: str  # ``folds``, or ``seeds`` if there is one fold
-    units: int  # number of units that both methods have, or 0 if there are fewer than two
-    p: float  # p value of the paired t test; NaN below two units, and if all differences are equal
-
-
-def observations(runs: Sequence[ComparedRun], question: Question, predictor: str = MODEL) -> pd.DataFrame:
-    """Return one row per run and recording: run (its index), seed, fold, tested, recording, sums ``s0``, ``s1`` ….
-
-    ``tested`` is the set of a run's recordings as text, which identifies folds without names.
-    """
-    import pandas as pd
-
-    rows = []
-    for index, run in enumerate(runs):
-        sums = run.questions[question].sums.get(predictor, {}) if question in run.questions else {}
-        tested = "\n".join(sorted(sums))
-        rows += [(index, run.seed, run.fold, tested, name, *parts) for name, parts in sums.items()]
-    width = max(map(len, rows), default=0) - len(ABOUT)
-    return pd.DataFrame(rows, columns=[*ABOUT, *(f"s{index}" for index in range(width))])
-
-
-def paired_runs(
-    first: Sequence[ComparedRun],
-    second: Sequence[ComparedRun],
-    question: Question,
-    predictors: tuple[str, str] = (MODEL, MODEL),
-) -> PairedRuns:
-    """Return the paired t test of two methods' scores by fold, or by seed if there is one fold.
-
-    Folds are identified by name, or else by the recordings that were evaluated.
-    """
-    for unit, column in (("folds", "fold"), ("folds", "tested"), ("seeds", "seed")):
-        first_scores, second_scores = (
-            _scores(runs, question, name, column) for runs, name in zip((first, second), predictors, strict=True)
-        )
-        common = [key for key in first_scores if key in second_scores]
-        if len(common) > 1:
-            pairs = [(first_scores[key], second_scores[key]) for key in common]
-            gains = [mine - yours for mine, yours in pairs]
-            are_equal = max(gains) - min(gains) < 1e-12 * max(map(abs, (*gains, 1.0)))
-            return PairedRuns(unit, len(pairs), math.nan if are_equal else paired_t(*zip(*pairs, strict=True)).p)
-    return PairedRuns("folds", 0, math.nan)
-
-
-def _scores(runs: Sequence[ComparedRun], question: Question, predictor: str, column: str) -> dict[Hashable, float]:
-    """Return the mean score of the runs of each value of a column."""
-    score = next(run for run in runs if question in run.questions).questions[question].measure.score_of
-    table = observations(runs, question, predictor).dropna(subset=column)
-    parts = [name for name in table.columns if name not in ABOUT]
-    scores: dict[Hashable, list[float]] = {}
-    for (_, key), rows in table.groupby(["run", column]):
-        scores.setdefault(key, []).append(score(rows[parts].to_numpy()))
-    return {key: sum(values) / len(values) for key, values in scores.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Literal
 
@@ -12,23 +12,22 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import Scalar
-from tacpipe.metrics import pairing
-from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins import registry
+from tacpipe.scores import pairing
+from tacpipe.scores.pairing import Measure, Sums
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    from tacpipe.comparison.engine import Comparison, ComparisonRow
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.report.blocks import Cell, Fold
-    from tacpipe.report.context import Context
 
     Details = TypeVar("Details", default=Any)  # data for the task's own sections
 else:
     from typing import TypeVar
 
     Details = TypeVar("Details")
+
+Reading = TypeVar("Reading", bound="TaskResults")
 
 
 @dataclass(frozen=True)
@@ -55,29 +54,39 @@ Settings = Mapping[str, Scalar]  # params and other settings of a method, by nam
 
 
 def distinct_names(
-    methods: Sequence[tuple[str, Settings]], usual: Collection[str | tuple[str, Scalar]] = ()
+    methods: Sequence[tuple[str, Settings]],
+    usual: Collection[str | tuple[str, Scalar]] = (),
+    runs: Sequence[int] = (),
 ) -> list[tuple[str, Settings]]:
-    """Return a unique name for each method, which is given as first name and settings, and the settings in that name.
+    """Return a unique name for each method, which is given as first name and settings, and the differing settings.
 
-    A name includes the settings in which methods with the same first name differ, except empty ones and those in
-    ``usual``, which contains names of settings, or pairs of name and value.
+    A name includes the settings in which methods with the same first name differ, except empty ones, values that more
+    than half of these methods' ``runs`` (1 per method by default) have, and those in ``usual``, which contains names of
+    settings, or pairs of name and value.
 
     >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
     [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
+    >>> [name for name, _ in distinct_names([("net", {"width": 8}), ("net", {"width": 9})], runs=[3, 1])]
+    ['net', 'net · width 9']
     """
-    settings_by_name: dict[str, list[Settings]] = {}
-    for name, settings in methods:
-        settings_by_name.setdefault(name, []).append(settings)
+    weighted: dict[str, list[tuple[Settings, int]]] = {}
+    for (name, settings), count in zip(methods, runs or [1] * len(methods), strict=True):
+        weighted.setdefault(name, []).append((settings, count))
     distinct: list[tuple[str, Settings]] = []
     for first_name, settings in methods:
+        others = weighted[first_name]
         differing = {
             name: value
             for name, value in settings.items()
-            if name not in usual
-            and (name, value) not in usual
-            and any(run.get(name) != value for run in settings_by_name[first_name])
+            if name not in usual and (name, value) not in usual and any(run.get(name) != value for run, _ in others)
         }
-        distinct.append((" · ".join([first_name, *marks(differing)]), differing))
+        total = sum(count for _, count in others)
+        uncommon = {
+            name: value
+            for name, value in differing.items()
+            if 2 * sum(count for run, count in others if run.get(name) == value) <= total
+        }
+        distinct.append((" · ".join([first_name, *marks(uncommon)]), differing))
     return distinct
 
 
@@ -177,14 +186,6 @@ class Method(Generic[Details]):
         """Details of its runs for the sections of the task."""
         return [run.details for run in self.runs]
 
-    def key_without(self, *names: str) -> str:
-        """Return a key that is equal for methods that differ only in these settings."""
-        return json.dumps(
-            [self.family, {name: value for name, value in self.settings.items() if name not in names}],
-            sort_keys=True,
-            default=str,
-        )
-
     def of(self, question: Question) -> list[ComparedRun[Details]]:
         """Return its runs that include a question."""
         return [run for run in self.runs if question in run.questions]
@@ -211,7 +212,8 @@ def grouped(runs: Sequence[ComparedRun], usual: Collection[str | tuple[str, Scal
     for run in runs:
         by_key.setdefault(_key(run), []).append(run)
     first_runs = [method_runs[0] for method_runs in by_key.values()]
-    names = distinct_names([(run.method, run.settings) for run in first_runs], usual)
+    counts = [len(method_runs) for method_runs in by_key.values()]
+    names = distinct_names([(run.method, run.settings) for run in first_runs], usual, counts)
     methods = [
         Method(name, first.family or first.method, first.settings, differing, tuple(method_runs))
         for (name, differing), first, method_runs in zip(names, first_runs, by_key.values(), strict=True)
@@ -251,19 +253,15 @@ class RecordingOutcome:
     is_right: bool
 
 
-class TaskReport:
-    """How results of one task are read, compared and reported.
-
-    A task's report is a subclass that overrides `read`, so that its results are compared, and the methods that add to
-    the page. An instance of this class reports results by their headlines and the numbers in ``metrics.json``.
-    """
+class TaskResults:
+    """How results of one task are read and compared; `tacpipe.report.context.TaskReport` adds how a page reports them."""
 
     title: str = ""  # predicted quantity in a few words; empty for the name of the task
     predictor_names: Mapping[str, str] = {}  # names in tables; others are written with spaces
     usual: Sequence[str | tuple[str, Any]] = ()  # settings, or settings with values, that are omitted from names
 
     def __init__(self, name: str) -> None:
-        """Report on the task ``name``."""
+        """Read results of the task ``name``."""
         self.name = name
         self.title = self.title or name.replace("_", " ")
 
@@ -279,41 +277,15 @@ class TaskReport:
         """Return the name of a predictor in tables."""
         return self.predictor_names.get(predictor, predictor.replace("_", " "))
 
-    def uses(self, dataset: Dataset) -> bool:
-        """Return whether the page can use a dataset that is not a result."""
-        return False
-
     def outcomes(self, run: ComparedRun) -> Sequence[RecordingOutcome]:
         """Return the predictions of a run's model that are right or wrong for a recording, for frames of cameras."""
         return []
 
-    def columns(
-        self, context: Context, comparison: Comparison
-    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
-        """Return additional columns for the table of all methods, as pairs of a head and a function from row to cell."""
-        return []
 
-    def sentence(self, context: Context) -> tuple[str, str] | None:
-        """Return the first sentence of the section and its verdict, or None for how the best method compares."""
-        return None
-
-    def folds(self, context: Context) -> Sequence[Fold]:
-        """Return the parts of the task's section after the comparison."""
-        return []
-
-    def caveats(self, context: Context) -> Sequence[str]:
-        """Return sentences about the limits of the numbers."""
-        return []
-
-    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
-        """Return additional columns for the table of runs, by head."""
-        return {}
-
-
-def report_on(task: str) -> TaskReport:
-    """Return the report of a task, or one by headlines if the task is not installed or has none."""
-    task_report = registry.load_task(task).report if task in registry.tasks() else None
-    return task_report or TaskReport(task)
+def report_on(task: str, default: type[Reading]) -> Reading:
+    """Return the report of a task, or the ``default``, which uses headlines, if it is not installed or has none."""
+    report: Reading | None = registry.load_task(task).report if task in registry.tasks() else None
+    return report or default(task)
 
 
 def task_of(result: Dataset) -> str:

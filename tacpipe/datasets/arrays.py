@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Int64s
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.schema import is_truth
 from tacpipe.datasets import selection
 from tacpipe.errors import UsageError
 from tacpipe.printable import plain
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import torch
 
-    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.datasets.reading import ReadableDataset
     from tacpipe.plugins.stage import Attribute
 
 TIME = "t_ns"
@@ -115,7 +115,7 @@ def is_channel(field: pa.Field) -> bool:
 
     if not (pa.types.is_integer(field.type) or pa.types.is_floating(field.type)):
         return False
-    if field.name in CLOCKS or field.name.startswith(TRUTH):
+    if field.name in CLOCKS or is_truth(field):
         return False
     return (field.metadata or {}).get(b"quantity", b"").decode() not in NOT_CHANNELS
 
@@ -142,7 +142,7 @@ def _exceeds_exact_range(array: AnyArray) -> bool:
 ONE_TABLE, LABELS_TABLE = "data", "labels"  # views of `connect_duckdb`
 
 
-def labels_frame(dataset: Dataset) -> pd.DataFrame:
+def labels_frame(dataset: ReadableDataset) -> pd.DataFrame:
     """Return the attributes as a frame with one row per recording (index ``recording``) and one column per attribute.
 
     Integers and booleans that some recordings lack have pandas' nullable types; other columns have the type of their
@@ -162,13 +162,13 @@ def _series(values: pd.Series[Any]) -> pd.Series[Any]:
     return values.convert_dtypes() if values.isna().any() else values.infer_objects()
 
 
-def _names(dataset: Dataset) -> list[str]:
+def _names(dataset: ReadableDataset) -> list[str]:
     """Return the names of all attributes, in the order of the recordings' attributes."""
     return list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
 
 
 def add_label_columns(
-    dataset: Dataset, tables: Mapping[str, pa.Table], names: Sequence[str] | None = None
+    dataset: ReadableDataset, tables: Mapping[str, pa.Table], names: Sequence[str] | None = None
 ) -> dict[str, pa.Table]:
     """Return the tables of recordings with a column added for each attribute in ``names``, or for all if it is None.
 
@@ -228,15 +228,14 @@ def to_pandas(table: pa.Table) -> pd.DataFrame:
     return frame
 
 
-def connect_duckdb(dataset: Dataset) -> duckdb.DuckDBPyConnection:
-    """Return a DuckDB connection with one view per stream and the view ``labels``; see `Dataset.duckdb`."""
+def connect_duckdb(dataset: ReadableDataset, tables: Mapping[str, pa.Table]) -> duckdb.DuckDBPyConnection:
+    """Return a DuckDB connection with a view of each table, by stream, and the view ``labels``; see `Dataset.duckdb`."""
     import duckdb
     import pyarrow as pa
 
     connection = duckdb.connect()
-    for stream in sorted({stream for recording in dataset for stream in recording.streams}):
-        recordings_with_stream = dataset.only(recording.name for recording in dataset if stream in recording.streams)
-        connection.register(stream or ONE_TABLE, recordings_with_stream.table(stream))
+    for stream, table in tables.items():
+        connection.register(stream or ONE_TABLE, table)
     names = pa.table({"recording": pa.array(list(dataset.recordings), pa.string())})
     rows = {recording.name: names.slice(index, 1) for index, recording in enumerate(dataset)}
     label_names = [name for name in _names(dataset) if name != "recording"]

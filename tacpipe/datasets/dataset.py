@@ -11,9 +11,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
-from tacpipe.datasets import pages
+from tacpipe.datasets import pages, selection
 from tacpipe.datasets.manifest import Manifest, ManifestJson
 from tacpipe.datasets.paths import shard_path
+from tacpipe.datasets.selection import Wanted
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 Reader = Callable[[str, str], bytes]  # (digest, path in the dataset's directory) -> verified content
-Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # a label's value, several values, or a predicate
 LARGE_BYTES = 1 << 24  # minimum size of a shard that is read from its file instead of memory
 _NAMED = 5  # number of recordings named in an error
 
@@ -288,8 +288,6 @@ class Dataset:
 
         Raises `UsageError` for a label that no recording has, and if no recording meets the conditions.
         """
-        from tacpipe.datasets import selection
-
         opened = self._open(split) if isinstance(split, str | Path) else split
         roles = selection.roles_of(opened, role, fold)
         return self.only(selection.select_names(self, names, roles, role, {**(labels or {}), **conditions}))
@@ -384,8 +382,12 @@ class Dataset:
         """
         from tacpipe.datasets import arrays
 
+        tables = {
+            stream: self.only(recording.name for recording in self if stream in recording.streams).table(stream)
+            for stream in sorted({stream for recording in self for stream in recording.streams})
+        }
         with extras.explain_missing("duckdb"):
-            return arrays.connect_duckdb(self)
+            return arrays.connect_duckdb(self, tables)
 
     def windows(
         self,

@@ -10,7 +10,7 @@ from tacpipe.datasets.pages import StoredPages
 from tacpipe.errors import StorageError
 from tacpipe.io import terminal
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.store import projects
+from tacpipe.store import layout, projects
 from tacpipe.store.store import MissingError, Store
 
 
@@ -59,8 +59,8 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
 def _needs(store: Store, manifest: Manifest) -> dict[str, int]:
     """Return the sizes of all objects of a dataset: shards, files, its manifest, and the manifests of its inputs."""
     sizes = dict(manifest.sizes()) | {bytes_digest(manifest.content): len(manifest.content)}
-    for digest in (dataset["manifest"] for datasets in manifest.inputs.values() for dataset in datasets):
-        entry = store.files.stat(f"objects/{digest[:2]}/{digest}")
+    for digest in manifest.ancestors:
+        entry = store.files.stat(layout.object_name(digest))
         if entry is not None:
             sizes[digest] = entry.bytes
     return sizes

@@ -12,6 +12,7 @@ from tacpipe.datasets import intervals, pages
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import Found, Manifest
 from tacpipe.errors import UsageError
+from tacpipe.io import config_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 from tacpipe.store.location import locate
@@ -43,8 +44,6 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
 
 def of_text(text: str) -> Attribute:
     """Return the value of a text that is a number, true, false or null, or else the text."""
-    from tacpipe.io import config_text
-
     return None if text == "null" else config_text.plain_value(text)
 
 

@@ -14,11 +14,11 @@ from tacpipe.datasets.manifest import InputDataset, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
-from tacpipe.metrics.headline import format_count
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
 from tacpipe.printable import listed
+from tacpipe.scores.words import format_count
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import Content, Provenance, RecordingEntry, RunIdentity
@@ -123,7 +123,7 @@ def _provenance(store: Store, manifest: str, written_s: int, key: str) -> Proven
     ``key`` names the run that produced or labelled it, if its root contains that; then no other record is read.
     """
     of_run = store.record(key) if key else None
-    for record in records.find_naming(store, manifest, written_s) if of_run is None else [of_run]:
+    for record in store.find_naming(manifest, written_s) if of_run is None else [of_run]:
         file = record["result"]["files"].get(manifest_of.NAME)
         if file is not None and file["digest"] == manifest:
             return record["provenance"]

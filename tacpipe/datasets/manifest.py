@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -123,6 +123,11 @@ class Manifest:
         return store.put(self.content, durable=durable)
 
     @property
+    def ancestors(self) -> list[str]:
+        """The digests of the manifests that this one was computed from."""
+        return [reference["manifest"] for references in self.inputs.values() for reference in references]
+
+    @property
     def recorded(self) -> bool:
         """Whether this is a dataset of recordings that was not computed from other datasets."""
         return bool(self.recordings) and not self.inputs
@@ -216,17 +221,10 @@ class Manifest:
         """Yield digest and size in bytes of every page, shard and file."""
         return ((name, size) for _, name, size in self.contents())
 
-    def reached(
-        self,
-        walked: dict[str, set[str]],
-        *,
-        lenient: bool = False,
-        read: Callable[[pages_of.Pages, int], set[str]] | None = None,
-    ) -> set[str]:
+    def reached(self, walked: dict[str, set[str]], *, lenient: bool = False) -> set[str]:
         """Return the digests of all pages, shards and files. ``walked`` caches those of pages already read, by digest.
 
-        If ``lenient``, the content of missing pages is skipped; otherwise they raise `MissingPageError`. ``read``
-        returns the digests of the shards in a page, by default from its checked content.
+        If ``lenient``, the content of missing pages is skipped; otherwise they raise `MissingPageError`.
         """
         pages = self.pages
         if pages is None:
@@ -235,7 +233,7 @@ class Manifest:
         for number, page in enumerate(pages.pages):
             if page.digest not in walked:
                 try:
-                    walked[page.digest] = (read or pages_of.shard_digests)(pages, number)
+                    walked[page.digest] = pages_of.shard_digests(pages, number)
                 except pages_of.MissingPageError:
                     if not lenient:
                         raise

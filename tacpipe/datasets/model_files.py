@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import torch
 
     from tacpipe.arrays import AnyArray
-    from tacpipe.tasks.task import Task
 
 CONFIG = "config.json"
 MAX_SIZE = 100_000  # maximum number of rows, points or units, far above that of any model
@@ -61,16 +60,14 @@ def validated(noun: str) -> Iterator[None]:
         ) from error
 
 
-def task(files: Mapping[str, bytes], place: str = "This") -> Task:
-    """Return the task of the model among ``files``.
+def task_name(files: Mapping[str, bytes], place: str = "This") -> str:
+    """Return the name of the task of the model among ``files``.
 
-    Raises `UsageError` if there is none, `TacpipeError` if it is invalid.
+    Raises `UsageError` if there is no model, `TacpipeError` if its configuration is invalid.
     """
-    from tacpipe.plugins import registry
-
     if CONFIG not in files:
         raise UsageError(f"{place} is not a model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
-    return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
+    return str(tree(files, CONFIG, {"task": str})["task"])
 
 
 def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | None = None) -> Any:

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING
 
 from tacpipe import printable
 from tacpipe.channels import streams
-from tacpipe.channels.streams import EVENTS, TRUTH
+from tacpipe.channels.schema import TRUTH
+from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.datasets.reading import ReadableDataset, ReadableRecording
     from tacpipe.io.columns import Columns
 
 NO_SIGNALS = (EVENTS, "truth")  # streams of events, and of ground truth in a simulation
@@ -31,7 +32,7 @@ def describe_streams(streams: Sequence[str]) -> str:
     return "is one table, not separate streams" if tuple(streams) == ("",) else f"has the streams {', '.join(streams)}"
 
 
-def streams_of(recording: Recording) -> dict[str, pa.Table]:
+def streams_of(recording: ReadableRecording) -> dict[str, pa.Table]:
     """Return the table of each stream with the recorded column names.
 
     Ground truth and the masks of a synchronized table are omitted.
@@ -39,7 +40,7 @@ def streams_of(recording: Recording) -> dict[str, pa.Table]:
     return split_tables({name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS})
 
 
-def columns_of(recording: Recording) -> Mapping[str, pa.Table | Columns]:
+def columns_of(recording: ReadableRecording) -> Mapping[str, pa.Table | Columns]:
     """Return the streams as `streams_of` does; columns of separate streams are decoded on first access."""
     if set(recording.streams) == {""}:
         return streams_of(recording)
@@ -78,7 +79,7 @@ _NAMED, _PARAMS, _LABELS = 4, 6, 8
 _VALUES = 5  # a label with more values is only counted
 
 
-def lines(dataset: Dataset) -> list[tuple[str, str]]:
+def lines(dataset: ReadableDataset) -> list[tuple[str, str]]:
     """Return title and text of each line.
 
     Streams and rates are those of the first recording, the only one that is read.
@@ -98,13 +99,13 @@ def lines(dataset: Dataset) -> list[tuple[str, str]]:
     return [(title, printable.lines([text])) for title, text in rows]
 
 
-def text(dataset: Dataset) -> str:
+def text(dataset: ReadableDataset) -> str:
     """Return the overview as lines of plain text."""
     body = [f"  {title:<11}{line}" for title, line in lines(dataset)]
     return "\n".join([f"<tacpipe.Dataset {_title(dataset)}>", *body])
 
 
-def html(dataset: Dataset) -> str:
+def html(dataset: ReadableDataset) -> str:
     """Return the overview as a small table for a notebook, with escaped text."""
     rows = "".join(
         f'<tr><th style="text-align:left">{escape(title)}</th><td style="text-align:left">{escape(line)}</td></tr>'
@@ -113,13 +114,11 @@ def html(dataset: Dataset) -> str:
     return f"<table><caption>tacpipe.Dataset {escape(_title(dataset))}</caption>{rows}</table>"
 
 
-def recording_html(recording: Recording) -> str:
+def recording_html(recording: ReadableRecording) -> str:
     """Return a recording for a notebook: its labels and a small plot of its streams, with escaped text."""
     from tacpipe.traces import curves, drawing, taxels
 
-    labels_shown = [
-        f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)
-    ]
+    labels_shown = [f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(TRUTH)]
     labels = escape(printable.lines([listed(labels_shown, _LABELS)])) if labels_shown else ""
     title = f"<b>{escape(printable.shown(recording.name))}</b> {labels}"
     try:
@@ -134,12 +133,12 @@ def recording_html(recording: Recording) -> str:
     return f"<div>{title}<br/>{picture}</div>"
 
 
-def _title(dataset: Dataset) -> str:
+def _title(dataset: ReadableDataset) -> str:
     place = "" if dataset.path is None else f"{printable.shown(str(dataset.path))} "
     return f"{place}[{dataset.digest[:12]}]"
 
 
-def _streams(recording: Recording) -> str:
+def _streams(recording: ReadableRecording) -> str:
     """Return the streams of a recording with their sizes as text, or why they cannot be read."""
     try:
         if recording.streams == ("",):
@@ -165,13 +164,13 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count != 1 else ''}"
 
 
-def _labels(dataset: Dataset) -> str:
+def _labels(dataset: ReadableDataset) -> str:
     """Return a text with the labels that have few values, how many recordings have each, and the number of other labels."""
     names = list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
     descriptions = []
     for name in names:
         values = Counter(str(recording.attributes[name]) for recording in dataset if name in recording.attributes)
-        if len(values) <= _VALUES and not name.startswith(streams.TRUTH):
+        if len(values) <= _VALUES and not name.startswith(TRUTH):
             descriptions.append(f"{name}: {', '.join(f'{value} ({count})' for value, count in sorted(values.items()))}")
     listed_labels = descriptions[:_LABELS]
     remaining = len(names) - len(listed_labels)

@@ -10,17 +10,19 @@ from collections.abc import Callable, Collection, ItemsView, Iterable, Iterator,
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.schema import TRUTH
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
+from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain, suggestion
 from tacpipe.store.records import Content, RecordingEntry, Step
 
 if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset, Wanted
+    from tacpipe.datasets.reading import ReadableDataset
 
+Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # a label's value, several values, or a predicate
 SPLIT_FILE = "split.parquet"
 _RECORDING = "split"  # name of a split's only recording
 
@@ -51,7 +53,7 @@ def roles_in_fold(roles: Mapping[tuple[str, int], str], fold: int, place: str) -
 _SHOWN, _LABELS = 5, 12  # number of names or values, and of labels, in an error
 
 
-def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, str] | None:
+def roles_of(split: ReadableDataset | None, role: str | None, fold: int) -> dict[str, str] | None:
     """Return the role by recording in ``fold`` of an opened split, only recordings with a role; None without a split.
 
     Raises `UsageError` if it is not a split or has no such fold, and for a ``role`` or a fold without a split.
@@ -71,7 +73,7 @@ def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, st
 
 
 def select_names(
-    dataset: Dataset,
+    dataset: ReadableDataset,
     patterns: Sequence[str],
     roles: Mapping[str, str] | None,
     role: str | None,
@@ -99,7 +101,7 @@ def select_names(
     return names
 
 
-def unknown_label(dataset: Dataset, label: str) -> UsageError:
+def unknown_label(dataset: ReadableDataset, label: str) -> UsageError:
     """Return the error for a label that no recording has; it lists the existing labels."""
     existing = sorted({name for recording in dataset for name in recording.attributes if not name.startswith(TRUTH)})
     return UsageError(
@@ -107,7 +109,7 @@ def unknown_label(dataset: Dataset, label: str) -> UsageError:
     )
 
 
-def _select_by_label(dataset: Dataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
+def _select_by_label(dataset: ReadableDataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
     """Return the names whose label meets the condition.
 
     Raises `UsageError` if no recording has the label, or none meets it.
@@ -136,7 +138,7 @@ def _predicate(condition: Wanted) -> Callable[[Attribute], Any]:
 class RecordingAttributes(Mapping[str, Mapping[str, Attribute]]):
     """The attributes of each recording, sorted by name; for a large dataset they are read on access."""
 
-    def __init__(self, dataset: Dataset) -> None:
+    def __init__(self, dataset: ReadableDataset) -> None:
         included = dataset.source.included
         is_large = isinstance(included, pages.Recordings) and len(included) == len(dataset)
         self.entries = included if is_large else {name: included[name] for name in dataset.recordings}
@@ -182,7 +184,7 @@ def equal_recordings(entries: Mapping[str, RecordingEntry]) -> list[list[str]]:
 PUBLISHED, SIMULATED = "published", "simulated"
 
 
-def is_simulated(dataset: Dataset) -> bool:
+def is_simulated(dataset: ReadableDataset) -> bool:
     """Return whether any recording of a dataset was simulated."""
     return any(bool(recording.attributes.get(SIMULATED)) for recording in dataset.recordings.values())
 
@@ -236,8 +238,6 @@ def chain_difference(expected: Sequence[Step], chain: Sequence[Step]) -> str:
     >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
     'synchronize has rate_hz 100.0 instead of 50.0'
     """
-    from tacpipe.plugins import params as params_of
-
     for ours, theirs in zip(expected, chain, strict=False):
         if ours["stage"] != theirs["stage"]:
             return f"{theirs['stage']} is where {ours['stage']} should be"

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.schema import TRUTH
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import ROLES, Attribute
 from tacpipe.printable import listed, plain, suggestion

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import itertools
+import tempfile
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict
+from typing import IO, TYPE_CHECKING, Literal, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -23,9 +24,9 @@ from tacpipe.signals.runs import rows_in_windows, run_starts, window_starts
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.datasets.reading import ReadableDataset, ReadableRecording
 
-KEPT_BYTES = 1 << 30  # maximum size of decoded recordings in memory, per process
+KEPT_BYTES = 1 << 30  # maximum size of an array of decoded recordings in memory; a larger one is in a temporary file
 TACTILE = "tactile"  # quantity of the channels with a level at rest
 
 
@@ -52,20 +53,51 @@ class _Selection(NamedTuple):
     scaling: Scaling | None
 
     def apply(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the selected channels of ``values`` (time, channel), scaled."""
-        selected = values if self.positions is None else values[:, self.positions]
+        """Return the selected channels of ``values`` (…, channel), scaled."""
+        selected = values if self.positions is None else values[..., self.positions]
         if self.scaling is None:
             return selected
         mean, std = map(torch.from_numpy, self.scaling)
         return ((selected.double() - mean) / std).to(values.dtype)
 
 
-class _RecordingRows(NamedTuple):
-    """The rows of one recording."""
+class _Decoded(NamedTuple):
+    """The rows of all recordings, one recording after the other."""
 
-    values: torch.Tensor  # (time, channel), not scaled; relative to rest if the rest level is subtracted
-    t_ns: torch.Tensor  # (time,)
+    values: torch.Tensor  # (row, channel), not scaled; relative to rest if the rest level is subtracted
+    t_ns: torch.Tensor  # (row,)
+    rows: Int64s  # (recording,), cumulative number of rows
     starts: Int64s  # (window,), first row of each window
+    windows: Int64s  # (recording,), cumulative number of windows
+
+
+class _GrowingArray:
+    """Rows that are in memory up to `KEPT_BYTES`, and otherwise in a temporary file."""
+
+    def __init__(self, empty: AnyArray) -> None:
+        """Start without rows; ``empty`` has the type, and the width until rows are appended."""
+        self._empty, self.rows = empty, 0
+        self._parts: list[AnyArray] = []
+        self._bytes = 0
+        self._file: IO[bytes] | None = None
+
+    def append(self, part: AnyArray) -> None:
+        """Append rows, all of one type and width."""
+        self._empty = part[:0]
+        self._parts.append(np.ascontiguousarray(part))
+        self.rows, self._bytes = self.rows + len(part), self._bytes + part.nbytes
+        if self._bytes > KEPT_BYTES:
+            self._file = self._file or tempfile.TemporaryFile()  # noqa: SIM115, `array` closes it
+            for waiting in self._parts:
+                waiting.tofile(self._file)
+            self._parts.clear()
+
+    def array(self) -> AnyArray:
+        """Return all rows."""
+        if self._file is None:
+            return np.concatenate(self._parts) if self._parts else self._empty
+        with self._file as file:  # the map keeps the removed file
+            return np.memmap(file, self._empty.dtype, "r+", shape=(self.rows, *self._empty.shape[1:]))
 
 
 class Windows(torch.utils.data.Dataset[Window]):
@@ -85,14 +117,14 @@ class Windows(torch.utils.data.Dataset[Window]):
     to the ``…_gap`` masks and ``t_ns``, and with finite numbers in every channel. No window crosses a gap or the end of
     a recording.
 
-    Nothing is read before the first ``len`` or item. Then each recording is read and verified once to find its windows;
-    up to 1 GiB of decoded recordings stays in memory. Windows can be pickled; each worker process of a loader reads for
-    itself.
+    Nothing is read before the first ``len`` or item. Then each recording is read and verified once. Decoded recordings
+    stay in memory, or from 1 GiB on in a temporary file, so items cost the same for any number of recordings. A loader
+    gets the windows of a batch at once. Windows can be pickled; a process that unpickles them reads the recordings again.
     """
 
     def __init__(
         self,
-        dataset: Dataset,
+        dataset: ReadableDataset,
         context: int,
         horizon: int,
         *,
@@ -122,39 +154,53 @@ class Windows(torch.utils.data.Dataset[Window]):
         self.stream, self.dtype, self.rest_s, self.scale = stream, dtype, rest_s, scale
         self._patterns = (inputs, targets) if columns is None else (columns, columns)
         self._names = list(dataset.recordings)
-        self._ends: Int64s | None = None  # (recording,), cumulative number of windows
+        self._content: _Decoded | None = None
         self._channels: tuple[tuple[str, ...], tuple[str, ...]] | None = None  # inputs and targets
         self._scaling: Scaling | None = None
-        self._cache: OrderedDict[str, _RecordingRows] = OrderedDict()
 
     def __len__(self) -> int:
-        return int(self._index()[-1]) if self._names else 0
+        return len(self._decoded.starts)
 
     def __getitem__(self, index: int) -> Window:
         """Return one window. Raises `IndexError` after the last."""
-        count = len(self)
-        if not -count <= index < count:
-            raise IndexError(f"There are {count} windows, and none has the index {index}.")
-        position = index % count
-        ends = self._index()
-        recording_index = int(np.searchsorted(ends, position, side="right"))
-        name = self._names[recording_index]
-        rows = self._rows(name)
-        start = int(rows.starts[position - (int(ends[recording_index - 1]) if recording_index else 0)])
+        decoded, position = self._decoded, self._positions_of([index])[0]
+        start = int(decoded.starts[position])
         split, stop = start + self.context, start + self.context + self.horizon
         return {
-            "past": self._past.apply(rows.values[start:split]),
-            "future": self._future.apply(rows.values[split:stop]),
-            "t_ns": rows.t_ns[start:stop],
-            "recording": name,
+            "past": self._past.apply(decoded.values[start:split]),
+            "future": self._future.apply(decoded.values[split:stop]),
+            "t_ns": decoded.t_ns[start:stop],
+            "recording": self._names[int(np.searchsorted(decoded.windows, position, side="right"))],
         }
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Window]:
+        """Return several windows, gathered at once. Raises `IndexError` after the last."""
+        decoded, length = self._decoded, self.context + self.horizon
+        positions = np.array(self._positions_of(indices), np.int64)
+        rows = torch.from_numpy(decoded.starts[positions][:, None] + np.arange(length)).flatten()
+        values = decoded.values.index_select(0, rows).view(len(positions), length, -1)
+        t_ns = decoded.t_ns.index_select(0, rows).view(len(positions), length)
+        past, future = self._past.apply(values[:, : self.context]), self._future.apply(values[:, self.context :])
+        names = [self._names[owner] for owner in np.searchsorted(decoded.windows, positions, side="right").tolist()]
+        return [
+            {"past": before, "future": after, "t_ns": times, "recording": name}
+            for before, after, times, name in zip(past.unbind(), future.unbind(), t_ns.unbind(), names, strict=True)
+        ]
+
+    def _positions_of(self, indices: Sequence[int]) -> list[int]:
+        """Return the places of windows, counted from the first. Raises `IndexError` after the last."""
+        count = len(self)
+        for index in indices:
+            if not -count <= index < count:
+                raise IndexError(f"There are {count} windows, and none has the index {index}.")
+        return [index % count for index in indices]
 
     def __repr__(self) -> str:
         lengths = f"context={self.context}, horizon={self.horizon}, stride={self.stride}"
         return f"Windows of {len(self._names)} recordings ({lengths}, {self.dtype})"
 
     def __getstate__(self) -> object:
-        return {**vars(self), "_cache": OrderedDict()}
+        return {**vars(self), "_content": None}
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -177,7 +223,6 @@ class Windows(torch.utils.data.Dataset[Window]):
         if self.scale is False:
             return None
         if self._scaling is None:
-            self._index()
             self._scaling = self._statistics() if self.scale is True else self._from_other(self.scale)
         return self._scaling
 
@@ -212,10 +257,10 @@ class Windows(torch.utils.data.Dataset[Window]):
         Raises `UsageError` without windows.
         """
         count, mean, squares = 0, np.zeros(len(self.columns)), np.zeros(len(self.columns))
-        for name in self._names:
-            rows = self._rows(name)
-            inside = rows_in_windows(rows.starts, self.context + self.horizon, len(rows.values))
-            values = rows.values.numpy()[inside].astype(np.float64)
+        decoded = self._decoded
+        inside = rows_in_windows(decoded.starts, self.context + self.horizon, len(decoded.t_ns))
+        for first, stop in itertools.pairwise([0, *decoded.rows.tolist()]):
+            values = decoded.values[first:stop].numpy()[inside[first:stop]].astype(np.float64)
             if len(values):  # means and squares of two parts can be added
                 difference = values.mean(axis=0) - mean
                 total = count + len(values)
@@ -246,24 +291,37 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     def _names_of_channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if self._channels is None:
-            self._index()
+            len(self)  # decoding finds the channels
         return self._channels or ((), ())
 
-    def _index(self) -> Int64s:
-        if self._ends is None:
-            self._ends = np.cumsum([len(self._rows(name).starts) for name in self._names], dtype=np.int64)
-        return self._ends
+    @property
+    def _decoded(self) -> _Decoded:
+        """The rows of all recordings, which are read on first use."""
+        if self._content is None:
+            values = _GrowingArray(np.zeros((0, 0), self.dtype))
+            t_ns = _GrowingArray(np.zeros(0, np.int64))
+            rows, windows, starts = [], [], [np.zeros(0, np.int64)]
+            for name in self._names:
+                own_values, own_t_ns, own_starts = self._decode_recording(self.dataset[name])
+                starts.append(own_starts + t_ns.rows)
+                values.append(own_values)
+                t_ns.append(own_t_ns)
+                rows.append(len(own_t_ns))
+                windows.append(len(own_starts))
+            self._content = _Decoded(
+                torch.from_numpy(values.array()),
+                torch.from_numpy(t_ns.array()),
+                np.cumsum(rows, dtype=np.int64),
+                np.concatenate(starts),
+                np.cumsum(windows, dtype=np.int64),
+            )
+        return self._content
 
-    def _rows(self, name: str) -> _RecordingRows:
-        """Return the rows of a recording, from memory if it was used recently."""
-        rows = self._cache.pop(name, None) or self._decode_recording(self.dataset[name])
-        self._cache[name] = rows  # moves it to the end as the most recently used
-        while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
-            self._cache.popitem(last=False)
-        return rows
+    def _decode_recording(self, recording: ReadableRecording) -> tuple[AnyArray, Int64s, Int64s]:
+        """Return values (row, channel), times (row,) and first rows of windows (window,) of a recording.
 
-    def _decode_recording(self, recording: Recording) -> _RecordingRows:
-        """Return the decoded rows of a recording. Raises `UsageError` if its channels differ from those of the others."""
+        Raises `UsageError` if its channels differ from those of the others.
+        """
         table = recording.table(self.stream)
         t_ns = streams.times(table)
         all_columns = arrays.arrays_of_table(table)
@@ -272,7 +330,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             self._channels = inputs, targets
         names = tuple(dict.fromkeys((*inputs, *targets)))
         if (inputs, targets) != self._channels:
-            odd = sorted(set(names) ^ set(self.columns)) or list(names)
+            odd = sorted(set(names) ^ {*self._channels[0], *self._channels[1]}) or list(names)
             raise UsageError(
                 f"Recording {recording.name} does not have the same channels as the others, or lacks one: {odd[0]}. "
                 f"Name the columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
@@ -287,7 +345,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
         inside = rows_in_windows(starts, self.context + self.horizon, len(t_ns))
         count_rows(recording.name, self.stream, RowCounts.from_masks(inside, [(IN_GAP, ~usable)]))
-        return _RecordingRows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
+        return values, t_ns, starts
 
 
 def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: str) -> tuple[str, ...]:
@@ -336,7 +394,3 @@ def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
             f"Recording {name} holds integers that {dtype} would round. Give dtype='float64', or other columns."
         )
     return values
-
-
-def _bytes(rows: _RecordingRows) -> int:
-    return rows.values.nbytes + rows.t_ns.nbytes

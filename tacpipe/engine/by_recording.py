@@ -114,7 +114,7 @@ class ByRecording:
     def _group_entries(self, group: _RecordingGroup) -> Mapping[str, RecordingEntry] | None:
         """Return the entries in a group's record, or None if there is no record or an object is missing."""
         record = self.store.record(digest(group.identity))
-        if record is None or not records.complete(self.store, record):
+        if record is None or not self.store.is_complete(record):
             return None
         self.outcome.reused += len(group.entries)
         self.outcome.add_group(records.summary(record))
@@ -155,7 +155,7 @@ class ByRecording:
         self.store.expect(digest(task.identity) for task in tasks)
         for task in tasks:
             record = self.store.record(digest(task.identity))
-            if record is not None and not rerun and records.complete(self.store, record):
+            if record is not None and not rerun and self.store.is_complete(record):
                 stored[task.recording] = record
                 self.outcome.add_record(name, task.recording, record)
             else:

@@ -21,7 +21,6 @@ from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import AnyStage
-from tacpipe.store import records
 from tacpipe.store.location import open_store
 from tacpipe.store.records import Provenance, StoredResult
 from tacpipe.store.store import Store
@@ -168,7 +167,7 @@ def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack)
         return Done(task.recording, {"result": result, "provenance": provenance.describe_provenance(0.0)})
     leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
     record = store.record(key)
-    if record is not None and not task.rerun and records.complete(store, record):
+    if record is not None and not task.rerun and store.is_complete(record):
         return Done(task.recording, record, is_new=False)
     started = time.perf_counter()
     replace = task.replace or record is not None
@@ -178,18 +177,18 @@ def _compute_result(task: WorkerTask, store: Store, key: str, leases: ExitStack)
         result, notes, rows = execution.execute(task, store, store)
     origin: Provenance = {
         **provenance.describe_provenance(round(time.perf_counter() - started, 4)),
-        "irreplaceable": stage.source,
+        "irreplaceable": stage.source is not None,
         "code": code,
         "packages": provenance.code_of_packages(task.identity, packages),
         "notes": notes,
     }
     if rows is not None:
         origin["rows"] = rows.to_json()
-    if stage.source:
+    if stage.source is not None:
         origin["columns"] = _stored_columns(store, result)
         # until a dataset's manifest exists, only the record marks this as a recording
         _single_manifest(task, stage, result).keep(store, durable=True)
-    return _Made(result, origin, replace, stage.source)
+    return _Made(result, origin, replace, stage.source is not None)
 
 
 def _stored_columns(store: Store, result: StoredResult) -> dict[str, list[str]]:

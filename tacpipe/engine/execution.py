@@ -107,7 +107,7 @@ def execute(
                     returned = _result(task.name, stage, stage(params, **arguments))
                 if stage.source:
                     returned = _name_source_of_batches(returned, task.files or {})
-                result = _store_returned(returned, sink, durable=stage.source)  # batches are read here
+                result = _store_returned(returned, sink, durable=stage.source is not None)  # batches are read here
         except Exception as error:
             failures.attach_stage(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise

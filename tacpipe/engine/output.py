@@ -114,19 +114,6 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
                 pass
 
 
-def existing_answer(store: Store, request: Request, work: CommandSource) -> Manifest | Unread | None:
-    """Return the result of `settle` if the output already shows the stored result, else None. Changes nothing."""
-    target = _output_place(store, request)
-    if (unread := target.unread(work)) is not None:
-        return unread
-    directory_look = target.look()
-    stored = work.answer()
-    if stored is None or not target.shows(stored, directory_look):
-        return None
-    target.note(directory_look, work, stored)
-    return target.settled(stored)
-
-
 def _output_place(store: Store, request: Request) -> _Place:
     return _File(store, request) if request.single_file else _Directory(store, request)
 

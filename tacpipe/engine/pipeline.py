@@ -27,7 +27,7 @@ from tacpipe.io import terminal
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import ORIGINALS, ROLES
+from tacpipe.plugins.stage import ROLES
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import Content, RecordingEntry, RunIdentity, StageIdentity, Step, StoredResult
@@ -66,6 +66,7 @@ def run(request: Request) -> Outcome:
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
     inputs = RequestInputs(request, store)
+    request = inputs.request  # its params may follow from the split
     with ChosenExecutor(request.executor, request.jobs) as chosen:
         work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
         outcome = work.outcome
@@ -74,24 +75,6 @@ def run(request: Request) -> Outcome:
             if isinstance(result, Manifest):  # otherwise there is nothing to track
                 end_tracking(result)
     return _conclude(outcome, inputs, result, started)
-
-
-def existing_outcome(request: Request) -> Outcome | None:
-    """Return the outcome of `run` if there is nothing to do, or None if something must be computed or written.
-
-    Raises the errors that `run` would raise before that. Computes and changes nothing.
-    """
-    started = time.perf_counter()
-    # these options always compute or report something
-    if request.check or request.compare or request.rerun or request.track:
-        return None
-    replacing.refuse_inputs(request.output, request.reads)
-    store = locate(*request.locations)
-    inputs = RequestInputs(request, store)
-    with ChosenExecutor(request.executor, request.jobs) as chosen:
-        work = _RequestRun(request, store, inputs, inputs.identity(), chosen)
-        result = output.existing_answer(store, request, work)
-    return None if result is None else _conclude(work.outcome, inputs, result, started)
 
 
 def _conclude(outcome: Outcome, inputs: RequestInputs, result: Manifest | Unread, started: float) -> Outcome:
@@ -144,6 +127,7 @@ class _RequestRun:
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [dataset.digest for dataset in inputs.used]
+        self._prepared_recordings: dict[str, Manifest] = {}  # by argument
         self.previous: Previous | None = None  # earlier run whose unchanged results are reused
 
     @property
@@ -287,19 +271,29 @@ class _RequestRun:
 
     # ---- stages over whole datasets
 
-    @cached_property
-    def _source(self) -> Manifest:
-        """The input datasets merged into one, after the stages of the model's chain."""
-        source, first = self.inputs.merged, self.stage.first
-        stages = first(self.request.params) if first is not None else {}
-        if not stages:
+    def _prepared(self, name: str) -> Manifest:
+        """Return the recordings of argument ``name`` after the stages that they go through first.
+
+        These are the stages that the argument's annotation states, else those of the model's chain. They run once.
+        """
+        if name not in self._prepared_recordings:
+            self._prepared_recordings[name] = self._prepare(name)
+        return self._prepared_recordings[name]
+
+    def _prepare(self, name: str) -> Manifest:
+        inputs, source, prepare = self.inputs, self.inputs.merged, self.stage.prepare(name)
+        stages = None if prepare is None else prepare(self.request.params)
+        if stages is not None:
+            steps = []
+            for first, options in stages.items():
+                stage = registry.load(first)
+                steps.append(keys.chain_step(first, stage, given_params.build(first, stage, options=options), None))
+            model = Manifest(self.request.name, self.stage.version, chain=[*source.chain, *steps])
+        elif "model" in inputs.named_datasets:
+            model = inputs.model
+        else:
             return source
-        chain = list(source.chain)
-        for name, options in stages.items():
-            stage = registry.load(name)
-            chain.append(keys.chain_step(name, stage, given_params.build(name, stage, options=options), None))
-        target = Manifest(self.request.name, self.stage.version, chain=chain)
-        return self._by_recording.replay(source, target, self.inputs.dataset_dirs, str(self.request.datasets[0]))
+        return self._by_recording.replay(source, model, inputs.dataset_dirs, str(self.request.datasets[0]))
 
     @cached_property
     def _parts(self) -> Manifest:
@@ -307,7 +301,8 @@ class _RequestRun:
 
         Raises `UsageError` if there is no recording.
         """
-        source, name = self._source, f"{self.request.name}{registry.PART}"
+        name = f"{self.request.name}{registry.PART}"
+        source = self._prepared(self.stage.argument("Dataset") or "")
         assert self.stage.part is not None
         step = keys.chain_step(name, self.stage.part, self.request.params, None)
         tasks = keys.shard_tasks(self.store, source, step, self.inputs.dataset_dirs)
@@ -353,33 +348,26 @@ class _RequestRun:
             return self._roles(name)
         if kind == "Parts":
             return keys.of_dataset(self._parts, None, self._parts.recordings)
-        if self.stage.part is not None:
-            source = inputs.merged if name == ORIGINALS else self._source
-            read_recordings = {
-                recording: entry for recording, entry in source.included.items() if recording in self._parts.recordings
-            }
-            return keys.of_dataset(source, reads, read_recordings)
         return self._identity_of_recordings(name)
 
     def _identity_of_recordings(self, name: str) -> Any:
         """Return the part of the key for the recordings of argument ``name``.
 
-        They are replayed through the model's chain, unless the stage takes them as given. With a split, only recordings of
-        one role are used: the role that ``name`` names, else ``--role``, else test. Raises `UsageError` for ``--role``
+        With a split, only recordings of one role are used, unless the stage reads the roles itself: the role that ``name``
+        names, else ``--role``, else test. Recordings whose part failed are left out. Raises `UsageError` for ``--role``
         without a split.
         """
-        inputs, reads, source = self.inputs, self.stage.reads, self.inputs.merged
-        as_given = self.stage.as_given
-        if "model" in inputs.named_datasets and not (as_given is not None and as_given(self.request.params)):
-            dataset_name = str(self.request.datasets[0])
-            source = self._by_recording.replay(source, inputs.model, inputs.dataset_dirs, dataset_name)
+        inputs, reads, source = self.inputs, self.stage.reads, self._prepared(name)
+        chosen: Mapping[str, RecordingEntry] = source.included
         if name in ROLES:
-            return keys.of_dataset(source, reads, inputs.in_role(source, name, may_lack=self.stage.optional(name)))
-        if "split" in inputs.named_datasets:
-            return keys.of_dataset(source, reads, inputs.in_role(source, self.request.role or "test"))
-        if self.request.role is not None:
+            chosen = inputs.in_role(source, name, may_lack=self.stage.optional(name))
+        elif "split" in inputs.named_datasets and "split" not in self.stage.arguments:
+            chosen = inputs.in_role(source, self.request.role or "test")
+        elif self.request.role is not None:
             raise UsageError(f"--role {self.request.role} has no effect without --split.")
-        return keys.of_dataset(source, reads, source.included)
+        if self.stage.part is not None:
+            chosen = {recording: entry for recording, entry in chosen.items() if recording in self._parts.recordings}
+        return keys.of_dataset(source, reads, chosen)
 
     def _roles(self, name: str) -> Any:
         """Return the identity of the roles of argument ``name``, or None if its option was not given.
@@ -407,7 +395,7 @@ class _RequestRun:
         """
         self.store.expect([digest(identity)])
         record = self.store.record(digest(identity))
-        is_stored = record is not None and records.complete(self.store, record)
+        is_stored = record is not None and self.store.is_complete(record)
         if record is not None and is_stored and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
             self.outcome.add_record(name, "", record)

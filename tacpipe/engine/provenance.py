@@ -82,11 +82,6 @@ def jobs() -> int:
     return int(setting)
 
 
-def jobs_of(commands: int) -> dict[str, str]:
-    """Return the variable that assigns each of several commands its part of the cores; empty if it is already set."""
-    return {} if JOBS in os.environ else {JOBS: str(max(1, usable_cores() // max(1, commands)))}
-
-
 def usable_cores() -> int:
     """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):

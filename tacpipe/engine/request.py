@@ -100,6 +100,7 @@ class RequestInputs:
         self.named_datasets: dict[str, Found] = {
             name: manifest.find(path) for name, path in request.named_paths.items() if name in DATASETS
         }
+        self.request = _with_group_of_split(request, self.named_datasets.get("split"))
         self.notes: list[str] = []  # warnings for the user
         self.sources = _discover_sources(self.stage, request)
         self.source_digests = _hash_sources(self.sources)
@@ -145,8 +146,10 @@ class RequestInputs:
         if self.request.source is None or not self.sources:
             return []
         read_paths = {path for source in self.sources.values() for path in source.files.values()}
-        if self.stage.why_unread is not None:
-            reason = self.stage.why_unread(self.request.params, self.request.source)
+        assert self.stage.source is not None
+        why_unread = self.stage.source.why_unread
+        if why_unread is not None:
+            reason = why_unread(self.request.params, self.request.source)
         else:
             command = self.request.name.replace(".", " ")
             reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
@@ -161,8 +164,7 @@ class RequestInputs:
             return []
         from tacpipe.checks import roles
 
-        stage = self.stage if trains else registry.stages().get(self.model.stage) and registry.load(self.model.stage)
-        requirements = stage.requirements if stage else None
+        requirements = registry.requirements(self.request.name if trains else self.model.stage)
         labels = {label.name for label in requirements.labels} if requirements else set()
         labels |= {getattr(self.request.params, "label", "")}
         recordings = self.merged.included
@@ -248,6 +250,15 @@ class RequestInputs:
         return chosen
 
 
+def _with_group_of_split(request: Request, split: Found | None) -> Request:
+    """Return a request whose empty param ``group`` names the labels by which the split keeps recordings together."""
+    if split is None or getattr(request.params, "group", None) != "":
+        return request
+    params = split.manifest.params
+    group = params.get("group") or params.get("apart") or params.get("by")
+    return replace(request, params=replace(request.params, group=str(group))) if group else request
+
+
 def _model_manifest(dataset: Found) -> Manifest:
     """Return the manifest of a model. Raises `UsageError` if the dataset is not a model."""
     manifest = dataset.manifest
@@ -265,14 +276,14 @@ def _discover_sources(stage: AnyStage, request: Request) -> dict[str, Source]:
     Raises `UsageError` if the source is missing, and the errors of `paths.refuse_shared_names` and
     `regular.expect_inside`.
     """
-    if not stage.source:
+    if stage.source is None:
         return {}
-    if request.source is None or stage.discover is None:
+    if request.source is None:
         raise UsageError(f"{request.name} needs a folder of recordings to read.")
     if not request.source.exists():
         raise UsageError(f"There is no {request.source} to read recordings from.")
     with failures.naming_source([request.source]):
-        discovered = stage.discover(request.params, request.source)
+        discovered = stage.source.discover(request.params, request.source)
     sources = {
         name: source if isinstance(source, Source) else Source(source) for name, source in sorted(discovered.items())
     }

@@ -13,8 +13,9 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from tacpipe.datasets import arrays
 from tacpipe.exports import contents
 from tacpipe.exports.contents import Column, Contents, Loss, stream_label
 from tacpipe.exports.files import README_NAME, Content, Files, loss_notes, sections
@@ -195,8 +196,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
 
 
-@stage(version=2, part=part)
-def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=2)
+def card(params: Params, recordings: Dataset, parts: Annotated[Parts, part]) -> Result:
     """Write a dataset card: Parquet, README.md, Croissant.
 
     Rows have native rates and types, and a column with the name of the recording. The folder can be uploaded unchanged.
@@ -252,7 +253,6 @@ def _labels(recordings: Dataset) -> bytes:
     """Return a table with one row per recording and one column per attribute."""
     import pyarrow as pa
 
-    from tacpipe.datasets import arrays
     from tacpipe.io.parquet import to_parquet
 
     rows = {recording.name: pa.table({RECORDING: pa.array([recording.name], pa.string())}) for recording in recordings}

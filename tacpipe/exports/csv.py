@@ -13,7 +13,7 @@ import functools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -62,8 +62,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(contents.part(recording, losses))}, written=writers)
 
 
-@stage(version=2, part=part)
-def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=2)
+def csv(params: Params, recordings: Dataset, parts: Annotated[Parts, part]) -> Result:
     """Write recordings as CSV files that can be read back.
 
     One file per stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` restores values, stamps, types, units

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Self
 
+from tacpipe.channels.schema import TRUTH
 from tacpipe.errors import StorageError
 from tacpipe.exports.contents import Contents, stream_label
 from tacpipe.plugins.stage import StoredParams
@@ -173,7 +174,7 @@ def _labels(recordings: Dataset) -> Mapping[str, Counter[str]]:
     counts: dict[str, Counter[str]] = {}
     for recording in recordings:
         for name, value in recording.attributes.items():
-            if isinstance(value, str | bool) and not name.startswith("gt_"):
+            if isinstance(value, str | bool) and not name.startswith(TRUTH):
                 counts.setdefault(name, Counter())[str(value)] += 1
     return counts
 

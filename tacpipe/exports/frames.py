@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, ArrayType
-from tacpipe.channels.streams import GRID, TRUTH
+from tacpipe.channels.schema import TRUTH, is_truth
+from tacpipe.channels.streams import GRID
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.exports import contents
@@ -36,6 +37,7 @@ class Channel:
     quantity: str
     unit: str
     type: str
+    is_target: bool = False  # whether it is ground truth of a simulation, or measured truth
 
     @property
     def short(self) -> str:
@@ -54,14 +56,18 @@ class Channel:
 
     @property
     def truth(self) -> bool:
-        """Whether it is ground truth, which keeps its name."""
+        """Whether it is ground truth of a simulation, which keeps its name."""
         return self.name.startswith(TRUTH)
 
     @property
     def signal(self) -> bool:
-        """Whether it is a number measured by a sensor or a robot."""
+        """Whether it is a number measured by a sensor or a robot, and no ground truth."""
         return (
-            bool(self.stream) and self.number and self.type != "bool" and self.quantity not in CLOCKS and not self.truth
+            bool(self.stream)
+            and self.number
+            and self.type != "bool"
+            and self.quantity not in CLOCKS
+            and not self.is_target
         )
 
 
@@ -141,7 +147,7 @@ def channels(table: pa.Table | Columns) -> list[Channel]:
         if field.name != TIME:
             metadata = contents.field_metadata(field)
             described = (metadata.get("stream", ""), metadata.get("quantity", ""), metadata.get("unit", ""))
-            result.append(Channel(field.name, *described, str(field.type)))
+            result.append(Channel(field.name, *described, str(field.type), is_truth(field)))
     return result
 
 

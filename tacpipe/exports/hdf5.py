@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, Roles, stage
 from tacpipe.printable import listed
+from tacpipe.video.decoding import decode_frames, read_batches
+from tacpipe.video.stream import PACKET, read_format
 
 if TYPE_CHECKING:
     import h5py
@@ -92,8 +94,8 @@ class Params:
             )
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the preceding stage if a rate is given."""
+def prepare(params: Params) -> Mapping[str, Mapping[str, str | float]]:
+    """Return the stage that synchronizes the recordings first, if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
@@ -113,8 +115,14 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copy_to_sink(content)})
 
 
-@stage(version=3, part=part, first=first)
-def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, split: Roles | None = None) -> Result:
+@stage(version=3)
+def hdf5(
+    params: Params,
+    recordings: Annotated[Dataset, prepare],
+    parts: Annotated[Parts, part],
+    originals: Dataset,
+    split: Roles | None = None,
+) -> Result:
     """Write recordings as HDF5 files.
 
     One file per recording, with one group per stream at its own rate; or ``--structure robomimic``, one file of
@@ -172,9 +180,6 @@ def _write_recording(params: Params, recording: Recording, losses: list[Loss], c
 
 def _write_images(group: h5py.Group, columns: Columns) -> None:
     """Write the decoded frames of a stream of frames, one chunk per frame; rows without a sound frame are black."""
-    from tacpipe.video.decoding import decode_frames, read_batches
-    from tacpipe.video.stream import PACKET, read_format
-
     video_format = read_format(columns)
     if video_format is None or not columns.num_rows:
         return

@@ -15,7 +15,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -82,8 +82,8 @@ quantity of each column.
 """
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the preceding stage if a rate is given."""
+def prepare(params: Params) -> Mapping[str, Mapping[str, str | float]]:
+    """Return the stage that synchronizes the recordings first, if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
@@ -118,8 +118,10 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 
-@stage(version=3, part=part, first=first, originals=shards)
-def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
+@stage(version=3, originals=shards)
+def lerobot(
+    params: Params, recordings: Annotated[Dataset, prepare], parts: Annotated[Parts, part], originals: Dataset
+) -> Result:
     """Write recordings as a LeRobot dataset (v3.0).
 
     Frames at one rate: synchronized recordings, or any with ``--rate-hz``. The robot's streams are observation.state,

@@ -23,6 +23,8 @@ from tacpipe.arrays import Bytes, Floats, Int64s
 from tacpipe.channels.schema import DAMAGED
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
+from tacpipe.video.decoding import decode_frames, read_batches, read_frames
+from tacpipe.video.files import add_stream
 from tacpipe.video.stream import (
     BATCH_ROWS,
     DTS,
@@ -127,8 +129,6 @@ def nearest_rows(columns: Columns, synchronized: Columns) -> Int64s:
 
 def images_of_rows(columns: Columns, rows: Int64s) -> Iterator[Bytes]:
     """Yield the image of each of the ascending ``rows``; a row without a sound image has the last one, or a black one."""
-    from tacpipe.video.decoding import decode_frames, read_batches
-
     video_format = VideoFormat.from_metadata(columns.schema.field(PACKET).metadata)
     start, _ = cut_rows(*_clocks(columns), int(rows[0]), int(rows[0]) + 1)
     frames = decode_frames(video_format, read_batches(columns, start))
@@ -204,9 +204,6 @@ class EpisodeVideo:
         """Copy the packets of the rows to a video file, with presentation times of the dataset's rate."""
         import av
 
-        from tacpipe.video.decoding import read_batches
-        from tacpipe.video.files import add_stream
-
         start, stop = int(self.rows[0]), int(self.rows[-1]) + 1
         stream = add_stream(container, self.video_format)
         stream.time_base = Fraction(1, TICKS)
@@ -245,8 +242,6 @@ class EpisodeVideo:
 
     def statistics(self) -> dict[str, list[Any]]:
         """Return the statistics of the colours, 0 to 1, of evenly spaced frames, each as (colour, 1, 1)."""
-        from tacpipe.video.decoding import read_frames
-
         sampled_rows = np.unique(np.linspace(0, len(self.rows) - 1, SAMPLED).round().astype(int))
         black: Bytes = np.zeros((1, 1, 3), np.uint8)  # if no sampled frame is sound
         images = list(read_frames(self.columns, self.rows[sampled_rows].tolist()).values()) or [black]

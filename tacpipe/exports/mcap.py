@@ -17,7 +17,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from tacpipe.exports import contents, files
 from tacpipe.exports.contents import TIME, ColumnName, Loss
 from tacpipe.exports.files import Files
 from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
+from tacpipe.video.stream import read_format
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -69,8 +70,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     return Result({"": RecordingOutput(contents.part(recording, losses, columns))}, written={f"{name}.mcap": write})
 
 
-@stage(version=3, part=part)
-def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=3)
+def mcap(params: Params, recordings: Dataset, parts: Annotated[Parts, part]) -> Result:
     """Write recordings as MCAP files for Foxglove and ROS 2.
 
     One file per recording, one topic per stream at its own rate with each column in its own type. Labels are metadata, and
@@ -111,7 +112,6 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
     """Yield the streams that become topics, and add to ``losses`` what the messages cannot represent."""
     from tacpipe.exports import ros
     from tacpipe.exports.pictures import Pictures
-    from tacpipe.video.stream import read_format
 
     starts = [start for start in (_start(recording, stream) for stream in recording.streams) if start is not None]
     for stream in recording.streams:
@@ -143,7 +143,7 @@ def _holds_images(table: Columns, name: str) -> bool:
     """Return whether the first value of a binary column is an encoded image."""
     import pyarrow as pa
 
-    from tacpipe.formats.arrays.tree import picture_encoding
+    from tacpipe.video.images import picture_encoding
 
     if not pa.types.is_binary(table.schema.field(name).type):
         return False

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pyarrow as pa
 
+from tacpipe.exports import ros
 from tacpipe.exports.contents import TIME
 from tacpipe.exports.ros import Topic
 from tacpipe.io.columns import Columns
@@ -29,8 +30,6 @@ class Pictures:
 
     def topic(self, stream: str, table: pa.Table) -> Topic:
         """Return the topic of the next block of rows; rows without a frame have no message."""
-        from tacpipe.exports import ros
-
         first, self._stop = self._stop, self._stop + table.num_rows
         block = list(self._frames_before(self._stop)) if table.num_rows else []
         t_ns = table.column(TIME).to_numpy()[[row - first for row, _ in block]]

@@ -24,7 +24,7 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports.contents import TIME, field_metadata, stream_label
-from tacpipe.formats.arrays.tree import picture_encoding
+from tacpipe.video.images import picture_encoding
 
 HEADER = b"\x00\x01\x00\x00"  # start of each message: CDR, little endian; alignment is relative to its end
 NS = 1_000_000_000

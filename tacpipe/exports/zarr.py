@@ -13,7 +13,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -65,8 +65,8 @@ class Params:
     images: bool = added(False)
 
 
-def first(params: Params) -> Mapping[str, Mapping[str, str | float]]:
-    """Return the preceding stage if a rate is given."""
+def prepare(params: Params) -> Mapping[str, Mapping[str, str | float]]:
+    """Return the stage that synchronizes the recordings first, if a rate is given."""
     from tacpipe.exports import frames
 
     return frames.synchronize_stage(params.rate_hz, params.master)
@@ -80,8 +80,10 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     return RecordingOutput(frames.describe(recording))
 
 
-@stage(version=2, part=part, first=first)
-def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
+@stage(version=2)
+def zarr(
+    params: Params, recordings: Annotated[Dataset, prepare], parts: Annotated[Parts, part], originals: Dataset
+) -> Result:
     """Write recordings as a Zarr replay buffer, as UMI does.
 
     Synchronized recordings, or any with ``--rate-hz``, one after another, with meta/episode_ends.

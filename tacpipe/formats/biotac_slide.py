@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.published import Params
 from tacpipe.io.files import walk
-from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Discovery, Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -76,7 +76,7 @@ def recording_name(material: int, trial: int) -> str:
     return f"biotac-m{material:02d}-t{trial:03d}"
 
 
-@stage(version=2, discover=discover)
+@stage(version=2, source=Discovery(discover))
 def biotac_slide(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of a BioTac over materials.
 

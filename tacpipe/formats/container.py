@@ -1,6 +1,6 @@
 """Recognize and open containers: files with several streams and their description, such as bags, HDF5 or XDF files.
 
-A format implements `Container`: the episodes, a preview of one, and the streams of one episode read in one pass. Each
+A format is a `Container`: the episodes, a preview of one, and the streams of one episode read in one pass. Each
 stream is a `SourceStream`: its name in the file (``source``), a stream name, the origin of its timestamps (`Time`), and
 rows whose fields have type, quantity, unit and layout as metadata. Rows are a table, or `Batched` if they do not all
 fit in memory. Unreadable sources are listed with reasons in `EpisodeContents.skipped`, missing parts of damaged files
@@ -12,7 +12,7 @@ new format is
 
 1. a module with ``opened(path) -> Container``, which imports its library inside functions;
 2. an entry in `tacpipe.formats.container.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
-3. a stage, created by `tacpipe.formats.table.contained.ContainerCommand`, with an entry point ``tacpipe.formats``.
+3. a stage, created by `tacpipe.formats.table.contained.LayoutCommand`, with an entry point ``tacpipe.formats``.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar, cast
 
 from tacpipe.errors import UsageError
 from tacpipe.io import config_text, regular
@@ -94,6 +95,13 @@ class Batched:
     rows: int
     read: Callable[[], Iterator[pa.Table]]
 
+    def with_fields(self, fields: Mapping[str, pa.Field]) -> Batched:
+        """Return the rows of some columns, each with another field."""
+        import pyarrow as pa
+
+        schema = pa.schema(list(fields.values()))
+        return self.mapped(schema, lambda table: pa.table([table.column(name) for name in fields], schema))
+
     def mapped(self, schema: pa.Schema, change: Callable[[pa.Table], pa.Table]) -> Batched:
         """Return the same rows with ``change`` applied to each table; its results have ``schema``."""
         return Batched(schema, self.rows, lambda: map(change, self.read()))
@@ -156,38 +164,33 @@ class Share:
     values: Values = field(default_factory=dict)  # further JSON values that the episode depends on
 
 
-@runtime_checkable
-class Sharing(Protocol):
-    """A container in which a changed file affects only the episodes that use it."""
-
-    def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
-        """Return the files that these streams of an episode are read from, or None if it is all files of the container."""
-
-
-@runtime_checkable
-class NamedContainer(Protocol):
-    """A container that may preserve recording names from before an export."""
-
-    @property
-    def names_itself(self) -> bool:
-        """Whether episode names are used without the container's name as prefix."""
-
-
 class Container(Protocol):
     """An open container. Its methods raise `TacpipeError` with the file's name if the file is invalid."""
 
+    path: Path
+
     @property
-    def path(self) -> Path:
-        """The path of the file or folder."""
+    def names_itself(self) -> bool:
+        """Whether episode names are used without the container's name as prefix, as those from before an export."""
+        return False
 
     def episodes(self) -> Sequence[str]:
         """Return the names of the recordings in the container, or an empty sequence if it is one recording."""
+        return ()
 
     def look(self, episode: str | None) -> EpisodeContents:
         """Return a preview: tables have all fields, and no rows or the first few."""
+        return self.read(None, episode)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams of these sources, or all if None, in one pass. Missing sources are ignored."""
+
+    def share(self, sources: Collection[str] | None, episode: str | None) -> Share | None:
+        """Return the files that these streams of an episode are read from, or None if it is all files of the container.
+
+        Then a changed file affects only the episodes that use it.
+        """
+        return None
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,7 @@ KINDS: Mapping[str, Kind] = {
         (".zgroup", ".zarray", "zarr.json"),
     ),
     "xdf": Kind("tacpipe.formats.xdf_streams:XdfFile", (".xdf", ".xdfz", ".xdf.gz")),
-    "lerobot": Kind("tacpipe.formats.lerobot.container:open_lerobot", (), ("meta/info.json",)),
+    "lerobot": Kind("tacpipe.formats.lerobot.container:LeRobotContainer", (), ("meta/info.json",)),
 }
 
 
@@ -307,6 +310,15 @@ def _name_stem(path: Path) -> str:
     return path.resolve().name.removesuffix(ending) if path.is_dir() else path.name[: len(path.name) - len(ending)]
 
 
+def natural_order(text: str) -> list[tuple[int, str]]:
+    """Return a key that sorts names with numbers by value.
+
+    >>> sorted(["demo_10", "demo_9", "demo"], key=natural_order)
+    ['demo', 'demo_9', 'demo_10']
+    """
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.findall(r"\d+|\D+", text)]
+
+
 def identifiers(sources: Sequence[str]) -> dict[str, str]:
     """Return a unique stream name for each source: an identifier that is unique regardless of case.
 
@@ -353,6 +365,38 @@ def parts_by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> d
 def json_value(text: str | bytes, path: Path) -> Any:
     """Return the JSON value in a file. Raises `ValueError` or `RecursionError` if it is invalid."""
     return json.loads(text, object_pairs_hook=lambda pairs: parts_by_name(pairs, path, "entry"))
+
+
+def json_object(text: str | bytes) -> Values:
+    """Return the JSON object in a text, or an empty object if it is none.
+
+    >>> json_object('{"a": 1}'), json_object("[1]"), json_object("")
+    ({'a': 1}, {}, {})
+    """
+    try:
+        value = json.loads(text or "{}")
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def plain_values(values: Mapping[Any, Any]) -> dict[str, Attribute]:
+    """Return the values that are text, numbers, true, false or None, as the attributes in an export of tacpipe."""
+    is_plain = str | int | float | bool | None
+    return {str(name): value for name, value in values.items() if isinstance(value, is_plain)}
+
+
+def flatten(values: Mapping[Any, Any], before: str = "", max_depth: int | None = None) -> dict[str, Any]:
+    """Return nested mappings, up to ``max_depth`` levels, as one mapping with dotted names.
+
+    >>> flatten({"sensor": {"name": "mine", "size": {"x": 1}}, "fps": 20}, max_depth=1)
+    {'sensor.name': 'mine', 'sensor.size': {'x': 1}, 'fps': 20}
+    """
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        is_nested = isinstance(value, dict) and (max_depth is None or before.count(".") < max_depth)
+        flat |= flatten(value, f"{before}{name}.", max_depth) if is_nested else {f"{before}{name}": value}
+    return flat
 
 
 EXAMPLES = 3  # number of example paths per group

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.formats.published import by_object, published_attribute, require
-from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Attribute, Discovery, Files, RecordingOutput, stage
 from tacpipe.plugins.video_checks import VideoChecks, check_videos
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return by_object(source, NAMES, "trial", example="lemon", described=tuple(VIDEOS), prefix="exp_num_")
 
 
-@stage(version=2, discover=discover)
+@stage(version=2, source=Discovery(discover))
 def gelsight_slip(params: Params, files: Files) -> RecordingOutput:
     """Read published videos of two GelSight Mini, with slip.
 

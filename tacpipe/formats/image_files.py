@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.container import natural_order
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
 from tacpipe.video.files import IMAGE_CODECS
@@ -23,18 +24,7 @@ def image_paths(folder: Path) -> list[Path]:
     images = [path for path in (folder / name for name in names) if path.suffix.lower() in IMAGE_CODECS]
     if not images:
         raise TacpipeError(f"{folder} holds no image. Give a folder with JPEG, PNG or WebP files.")
-    return sorted(
-        images, key=lambda path: [(int(part), "") if part.isdigit() else (-1, part) for part in parts_of(path)]
-    )
-
-
-def parts_of(path: Path) -> list[str]:
-    """Return a file name split before and after each number.
-
-    >>> parts_of(Path("a/frame_12.jpg"))
-    ['frame_', '12', '.jpg']
-    """
-    return [part for part in re.split(r"([0-9]+)", path.name) if part]
+    return sorted(images, key=lambda path: natural_order(path.name))
 
 
 def last_number(path: Path) -> str | None:

@@ -18,17 +18,20 @@ import math
 import os
 import re
 import tokenize
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import published
+from tacpipe.formats.faults import explaining
 from tacpipe.io import regular
 from tacpipe.io.files import walk
 from tacpipe.plugins.constraints import Rate
-from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Attribute, Discovery, Files, RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyArray, Float32s
@@ -87,7 +90,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return files_by_slide
 
 
-@stage(version=2, discover=discover)
+@stage(version=2, source=Discovery(discover))
 def roboskin(params: Params, files: Files) -> RecordingOutput:
     """Read published slides of an iCub RoboSkin.
 
@@ -97,7 +100,6 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
     import numpy as np
 
     from tacpipe.channels import schema
-    from tacpipe.formats import published
     from tacpipe.signals.resampling import uniform_grid
 
     (block, index), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
@@ -141,7 +143,7 @@ def _count_slides(path: Path) -> int:
 
     Raises `TacpipeError` if it is not an array of numbers (slide, triangle, taxel, time) of the declared size.
     """
-    try:
+    with _refusing_damage(path):
         with regular.failing(path), regular.opened(path) as file:
             if file.read(6) != b"\x93NUMPY":
                 raise ValueError("it does not begin as an array of numpy does")
@@ -152,8 +154,6 @@ def _count_slides(path: Path) -> int:
             header = ast.literal_eval(file.read(header_bytes).decode())
             available = os.fstat(file.fileno()).st_size - file.tell()
         shape, kind = header["shape"], KIND.fullmatch(header["descr"])
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from error
     if not (isinstance(shape, tuple) and len(shape) == 4 and all(type(size) is int and size > 0 for size in shape)):
         raise TacpipeError(
             f"{path} has the shape {excerpt(shape)}; it must be (slide, triangle, taxel, time). Give the set's own files."
@@ -255,7 +255,7 @@ def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
     import numpy as np
 
     content = regular.source(path)
-    try:
+    with _refusing_damage(path):
         file = io.BytesIO(content)
         is_long = np.lib.format.read_magic(file) != (1, 0)
         read_header = np.lib.format.read_array_header_2_0 if is_long else np.lib.format.read_array_header_1_0
@@ -263,15 +263,14 @@ def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
         if math.prod(shape) * kind.itemsize > len(content):  # checked before np.load, which allocates the array
             raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
         array: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from error
     array.flags.writeable = False
     return array
 
 
-def _unreadable(path: Path, error: BaseException) -> TacpipeError:
-    described = plain(" ".join(str(error).split()), 200)
-    return TacpipeError(f"{path} cannot be read as an array of numbers: {described}. Copy it again from its source.")
+def _refusing_damage(path: Path) -> AbstractContextManager[None]:
+    """Raise errors of a damaged array in the block as a `TacpipeError`."""
+    advice = ". Copy it again from its source."
+    return explaining(UNREADABLE, f"{path} cannot be read as an array of numbers: ", advice)
 
 
 MIN_AUTOCORRELATION = 0.5  # minimum lag-1 autocorrelation along the time axis

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import published
+from tacpipe.formats.faults import explaining
 from tacpipe.formats.published import by_object, require
 from tacpipe.io import regular
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins.constraints import NonNegativeFloat, Unit
-from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Discovery, Files, RecordingOutput, stage
 from tacpipe.plugins.stream_selection import StreamSelection
-from tacpipe.printable import plain
 
 if TYPE_CHECKING:
     from tacpipe.clouds.cloud import Cloud
@@ -58,7 +58,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return files_by_grasp
 
 
-@stage(version=2, discover=discover)
+@stage(version=2, source=Discovery(discover))
 def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     """Read published grasps with a point cloud and BioTac SPs.
 
@@ -126,10 +126,9 @@ def _add_twins(files_by_grasp: dict[str, dict[str, Path]]) -> None:
 
 def _read_lines(path: Path) -> list[str]:
     """Return the lines of a small text file. Raises `TacpipeError` if it is empty or not text."""
-    try:
-        lines = regular.source(path).decode("ascii").splitlines()
-    except UnicodeDecodeError as error:
-        raise TacpipeError(f"{path} cannot be read as text: {error}. Copy it again from its source.") from error
+    content = regular.source(path)
+    with explaining(UnicodeDecodeError, f"{path} cannot be read as text: ", ". Copy it again from its source."):
+        lines = content.decode("ascii").splitlines()
     while lines and not lines[-1].strip():
         lines.pop()
     if not lines:
@@ -153,12 +152,8 @@ def _read_grasp(path: Path) -> Grasp:
             f"{path} has {len(lines)} lines, the first of {len(cells)} numbers; it must be one line of {POINTS} numbers, "
             f"two points in metres, or of {WITH_WRIST}, these and the wrist's rotation row by row. Copy it again."
         )
-    try:
+    with explaining(ValueError, f"{path}, row 1: ", f"; all {len(cells)} cells must be numbers. Copy it again."):
         values = np.array([float(cell) for cell in cells])
-    except ValueError as error:
-        raise TacpipeError(
-            f"{path}, row 1: {plain(str(error), 100)}; all {len(cells)} cells must be numbers. Copy it again."
-        ) from error
     try:
         return Grasp(values[:3], values[3:6], values[6:].reshape(3, 3) if len(cells) == WITH_WRIST else None)
     except TacpipeError as error:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import itertools
 import mmap
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from tacpipe.arrays import AnyArray, Floats
 from tacpipe.errors import TacpipeError
 
 Content = bytes | mmap.mmap
+Values = TypeVar("Values")
 
 MAGIC = b"XDF:"
 FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
@@ -107,19 +109,53 @@ class ChunkSamples:
     missing: int = 0
 
 
-def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> ChunkSamples | None:
-    """Return the complete samples of a numeric chunk, or None if even their count is missing."""
+def parse_samples(content: bytes, kind: np.dtype[np.generic] | None, channels: int) -> ChunkSamples | None:
+    """Return the complete samples of a chunk of numbers, or of texts if ``kind`` is None.
+
+    Returns None if even their count is missing.
+    """
     count = read_length(content, 0)
     if count is None:
         return None
     declared, begin = count
     body = content[begin:]
+    if kind is None:
+        stamps, texts = _read_each(body, declared, lambda at: _read_words(body, at, channels))
+        words = np.array(list(itertools.chain(*texts)), dtype=object).reshape(-1, channels)
+        return ChunkSamples(stamps, words, declared - len(texts))
     little_endian = kind.newbyteorder("<")
     for stamp_count in (declared, 1 if declared else 0, 0):  # all samples have a timestamp, only the first, or none
         samples = _parse_regular(body, little_endian, channels, declared, stamp_count)
         if samples is not None:
             return samples
-    return _parse_irregular(body, little_endian, channels, declared)
+    size = channels * kind.itemsize
+    stamps, values = _read_each(
+        body, declared, lambda at: (body[at : at + size], at + size) if at + size <= len(body) else None
+    )
+    numbers = np.frombuffer(b"".join(values), little_endian).reshape(-1, channels).astype(kind.newbyteorder("="))
+    return ChunkSamples(stamps, numbers, declared - len(values))
+
+
+def _read_each(
+    body: bytes, count: int, read_values: Callable[[int], tuple[Values, int] | None]
+) -> tuple[Floats, list[Values]]:
+    """Return stamps and values of the samples before the first incomplete one, of ``count``.
+
+    ``read_values`` returns the values of the sample at an offset, and the offset after them, or None if they are
+    incomplete.
+    """
+    stamps: list[float] = []
+    values: list[Values] = []
+    offset = 0
+    while len(values) < count:
+        stamp = _read_stamp(body, offset)
+        sample = None if stamp is None else read_values(stamp[1])
+        if stamp is None or sample is None:
+            break
+        stamps.append(stamp[0])
+        values.append(sample[0])
+        offset = sample[1]
+    return np.array(stamps, dtype=np.float64), values
 
 
 def _parse_regular(
@@ -136,43 +172,6 @@ def _parse_regular(
         return None
     stamps = np.concatenate([first["stamp"], np.full(len(unstamped), np.nan)])
     return ChunkSamples(stamps, np.concatenate([first["values"], unstamped["values"]]).astype(kind.newbyteorder("=")))
-
-
-def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> ChunkSamples:
-    """Return the samples before the first incomplete one, parsed one by one."""
-    stamps, values, start, size = [], [], 0, channels * kind.itemsize
-    for _ in range(count):
-        stamp_and_end = _read_stamp(body, start)
-        if stamp_and_end is None:
-            break
-        stamp, end = stamp_and_end
-        if end + size > len(body):
-            break
-        stamps.append(stamp)
-        values.append(body[end : end + size])
-        start = end + size
-    table = np.frombuffer(b"".join(values), kind).reshape(-1, channels).astype(kind.newbyteorder("="))
-    return ChunkSamples(np.array(stamps, dtype=np.float64), table, count - len(stamps))
-
-
-def parse_texts(content: bytes, channels: int) -> ChunkSamples | None:
-    """Return the complete samples of a text chunk, or None if even their count is missing."""
-    count = read_length(content, 0)
-    if count is None:
-        return None
-    declared, offset = count
-    stamps: list[float] = []
-    rows: list[list[str]] = []
-    while len(rows) < declared:
-        stamp = _read_stamp(content, offset)
-        words = None if stamp is None else _read_words(content, stamp[1], channels)
-        if stamp is None or words is None:
-            break
-        stamps.append(stamp[0])
-        rows.append(words[0])
-        offset = words[1]
-    table = np.array(list(itertools.chain(*rows)), dtype=object).reshape(-1, channels)
-    return ChunkSamples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
 
 
 def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:

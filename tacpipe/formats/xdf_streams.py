@@ -25,7 +25,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import container, xdf_chunks, xdf_restarts
-from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.formats.container import Batched, Container, EpisodeContents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, DamagedChunk
 from tacpipe.formats.xdf_times import is_valid, recorder_times
 from tacpipe.io import regular
@@ -64,11 +64,8 @@ class StreamReading:
     def add_samples(self, content: bytes) -> None:
         """Add the samples of a chunk. Omitted timestamps continue at the stream's rate."""
         channels = len(self.about.channels)
-        samples = (
-            xdf_chunks.parse_texts(content, channels)
-            if self.about.is_text
-            else xdf_chunks.parse_numbers(content, np.dtype(self.about.dtype), channels)
-        )
+        kind = None if self.about.is_text else np.dtype(self.about.dtype)
+        samples = xdf_chunks.parse_samples(content, kind, channels)
         if samples is None:
             self.missing += 1
             return
@@ -144,18 +141,10 @@ class _FileReading:
 
 
 @dataclass(frozen=True)
-class XdfFile:
-    """An XDF file as a container."""
+class XdfFile(Container):
+    """An XDF file, which is one recording. Without an index, a preview must read the whole file."""
 
     path: Path
-
-    def episodes(self) -> Sequence[str]:
-        """Return an empty sequence, because a file is one recording."""
-        return ()
-
-    def look(self, episode: str | None) -> EpisodeContents:
-        """Return the full contents; without an index, a preview must read the whole file."""
-        return self.read(None, episode)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         """Return the streams, and the clock offsets of each stream that was compared with the recorder's clock.
@@ -187,12 +176,13 @@ class XdfFile:
             [source + suffix for source in dict.fromkeys(sources_by_number.values()) for suffix in suffixes]
         )
         streams: list[SourceStream] = []
-        attributes = _file_attributes(reading.header)
+        start = _xml_text(reading.header, "datetime")
+        attributes: dict[str, Attribute] = {"recorded_at": start} if start else {}
         for group in groups:
             source, parts = sources_by_number[group[0]], [timed[number] for number in group]
             longest = max(parts, key=lambda part: part.rows)
             attributes |= {f"{names[source]}_{name}": value for name, value in longest.fit.items()}
-            contents = {source: _joined([_stream_content(part) for part in parts])}
+            contents = {source: _stream_content(parts)}
             if offsets := [_offsets_table(part) for part in parts if part.offsets]:
                 contents[source + OFFSETS_SUFFIX] = pa.concat_tables(offsets).sort_by(RECORDER_TIME)
             for name, content in contents.items():
@@ -271,7 +261,8 @@ def _add_chunk(reading: _FileReading, chunk: Chunk | DamagedChunk, path: Path) -
         stream.offsets.append(struct.unpack_from("<dd", chunk.content))
         stream.rows_before.append(stream.rows)
     elif chunk.tag == xdf_chunks.STREAM_FOOTER:
-        reading.streams[chunk.stream].declared_rows = _sample_count(chunk.content)
+        count = _xml_text(chunk.content, "sample_count")
+        reading.streams[chunk.stream].declared_rows = int(count) if count.isdecimal() else None
 
 
 def _store_description(reading: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
@@ -290,13 +281,12 @@ def _store_description(reading: _FileReading, stream: int, chunk: Chunk, path: P
         )
 
 
-def _sample_count(footer: bytes) -> int | None:
-    """Return the number of samples according to a footer, or None if the footer does not contain it."""
+def _xml_text(content: bytes, name: str) -> str:
+    """Return the text of an entry of a header or footer, or "" if it has none or is damaged."""
     try:
-        text = ET.fromstring(footer.decode(errors="replace")).findtext("sample_count", "")
+        return ET.fromstring(content.decode(errors="replace")).findtext(name, "").strip()
     except ET.ParseError:
-        return None
-    return int(text) if text.isdecimal() else None
+        return ""
 
 
 def _stream_sources(streams: Mapping[int, StreamReading]) -> dict[int, str]:
@@ -304,15 +294,6 @@ def _stream_sources(streams: Mapping[int, StreamReading]) -> dict[int, str]:
     names = {number: stream.about.name or stream.about.kind or f"stream {number}" for number, stream in streams.items()}
     name_list = list(names.values())
     return {number: name if name_list.count(name) == 1 else f"{name} {number}" for number, name in names.items()}
-
-
-def _file_attributes(header: bytes) -> dict[str, Attribute]:
-    """Return the attribute with the start of the recording, if the file header has one."""
-    try:
-        stamp = ET.fromstring(header.decode(errors="replace")).findtext("datetime", "").strip()
-    except ET.ParseError:
-        return {}
-    return {"recorded_at": stamp} if stamp else {}
 
 
 def _describe_losses(stream: StreamReading) -> list[str]:
@@ -323,32 +304,23 @@ def _describe_losses(stream: StreamReading) -> list[str]:
     return losses
 
 
-def _joined(contents: Sequence[pa.Table | Batched]) -> pa.Table | Batched:
-    """Return the samples of the parts of a stream, in their order."""
-    if not any(isinstance(content, Batched) for content in contents):
-        return pa.concat_tables(contents)
+def _stream_content(parts: Sequence[StreamReading]) -> pa.Table | Batched:
+    """Return the samples of the parts of a stream with their timestamps, in their order.
+
+    They are a table if there are few, else batches from the spill file.
+    """
+    schema = pa.schema([_time_field(RECORDER_TIME), _time_field(SENDER_TIME), *parts[0].fields])
 
     def read() -> Iterator[pa.Table]:
-        for content in contents:
-            yield from content.read() if isinstance(content, Batched) else [content]
+        for part in parts:
+            raw_ns, start = lsl.nanoseconds(np.concatenate(part.stamps)), 0
+            for columns in part.channels():
+                stop = start + len(columns[0])
+                yield pa.table([pa.array(part.t_ns[start:stop]), pa.array(raw_ns[start:stop]), *columns], schema)
+                start = stop
 
-    rows = sum(content.rows if isinstance(content, Batched) else content.num_rows for content in contents)
-    return Batched(contents[0].schema, rows, read)
-
-
-def _stream_content(stream: StreamReading) -> pa.Table | Batched:
-    """Return the samples with their timestamps: a table if there are few, else batches from the spill file."""
-    schema = pa.schema([_time_field(RECORDER_TIME), _time_field(SENDER_TIME), *stream.fields])
-    raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
-
-    def read() -> Iterator[pa.Table]:
-        start = 0
-        for columns in stream.channels():
-            stop = start + len(columns[0])
-            yield pa.table([pa.array(stream.t_ns[start:stop]), pa.array(raw_ns[start:stop]), *columns], schema)
-            start = stop
-
-    return Batched(schema, stream.rows, read) if stream.pieces else next(read())
+    is_spilled = any(part.pieces for part in parts)
+    return Batched(schema, sum(part.rows for part in parts), read) if is_spilled else pa.concat_tables(read())
 
 
 def _time_field(name: str) -> pa.Field:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.formats.published import Params, trials
-from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Discovery, Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,7 +31,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return trials(source, NAMES)
 
 
-@stage(version=3, discover=discover)
+@stage(version=3, source=Discovery(discover))
 def xela_flat(params: Params, files: Files) -> RecordingOutput:
     """Read published trials of two XELA uSkin, flat folder.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params, trials
-from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.plugins.stage import Discovery, Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,7 +29,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return trials(source, NAMES)
 
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def xela_psc(params: Params, files: Files) -> RecordingOutput:
     """Read published trials of two XELA uSkin, with slip.
 

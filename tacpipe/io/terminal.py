@@ -122,7 +122,7 @@ class RowGroup:
 class TerminalTable:
     """Groups of rows with the same columns, and a caption."""
 
-    heads: Sequence[str]
+    heads: Sequence[str]  # may have several lines
     groups: Sequence[RowGroup]
     caption: str = ""
     spare: Sequence[int] = ()  # indices of columns that may be omitted on a narrow terminal, in this order
@@ -143,7 +143,7 @@ class TerminalTable:
             ]
             return (indent + GAP.join(padded)).rstrip()
 
-        lines = [(format_line(self.heads), "bold")]
+        lines = [(format_line(row), "bold") for row in self._head_rows()]
         for group in self.groups:
             lines += [(group.heading, "bold")] if group.heading else []
             lines += [(format_line(row.cells), row.style) for row in group.rows]
@@ -154,8 +154,14 @@ class TerminalTable:
         """Return the table as lines of text."""
         return "\n".join(text for text, _ in self.lines(width))
 
+    def _head_rows(self) -> Iterator[Sequence[str]]:
+        """Yield the lines of the heads, of which the last ones stand above the first group."""
+        parts = [head.split("\n") for head in self.heads]
+        for line in range(-max(map(len, parts), default=1), 0):
+            yield [part[line] if -line <= len(part) else "" for part in parts]
+
     def _all_rows(self) -> Iterator[Sequence[str]]:
-        yield self.heads
+        yield from self._head_rows()
         for group in self.groups:
             yield from (row.cells for row in group.rows)
 

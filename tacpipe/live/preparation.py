@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
+from tacpipe.engine.pipeline import open_dataset
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.live import publishing, wire
 from tacpipe.live.settings import LiveTask, SessionOptions, Settings, SettingValues, parse_option
-from tacpipe.plugins import fields
+from tacpipe.plugins import fields, registry
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 from tacpipe.recording import recorder
@@ -23,7 +25,6 @@ from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.sensor import Options
 
-CONFIG = "config.json"
 PATHS = ("model",)
 
 
@@ -78,14 +79,9 @@ def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
 
 def open_model(path: str) -> LiveModel:
     """Return the model at a path. Raises `UsageError` if it is not a model, or its task does not run live."""
-    from tacpipe.datasets import model_files
-    from tacpipe.engine.pipeline import open_dataset
-
     dataset = open_dataset(path)
-    if CONFIG not in dataset.files:
-        raise UsageError(f"{path} is not a model; give one of `tacpipe train`.")
-    name = str(model_files.tree(dataset.files, CONFIG, {"task": str})["task"])
-    live = model_files.task(dataset.files, path).live
+    name = model_files.task_name(dataset.files, path)
+    live: LiveTask | None = registry.load_task(name).live
     if live is None:
         raise UsageError(f"{path} was trained for {plain(name)}, whose models do not run live.")
     return LiveModel(name, live, dataset)

@@ -22,6 +22,7 @@ from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.live import publishing, wire
 from tacpipe.live.engine import Continuation, Engine
 from tacpipe.live.messages import Message
+from tacpipe.live.preparation import open_model
 from tacpipe.live.publishing import Publishers
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
@@ -173,8 +174,6 @@ def send_line(connection: socket.socket, content: wire.ModelLine) -> None:
 
 def open_engine(options: SessionOptions) -> Engine:
     """Return the engine of a session. Raises `UsageError` if model, rig and settings do not match."""
-    from tacpipe.live.preparation import open_model
-
     model = open_model(options.settings.model)
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}

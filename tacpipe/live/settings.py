@@ -27,10 +27,10 @@ from tacpipe.plugins.stage import Attribute, Result
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.engine import Engine
+    from tacpipe.plugins.model import PredictionRequest
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.live import Declaration
     from tacpipe.sensors.sensor import Options, Sensor
-    from tacpipe.tasks.task import PredictionRequest
 
 SettingValues = Mapping[str, Scalar | Sequence[Scalar] | None]  # values by name, from a rig file or options
 NOT_SET = ("task", "places")  # fields of `Settings` that are neither keys nor options
@@ -131,7 +131,7 @@ class SessionOptions:
     def from_json(cls, text: str) -> Self:
         """Return the options in a line from `to_json`. Raises `UsageError` if the task does not run live."""
         content = json.loads(text)
-        live = registry.load_task(content["task"]).live
+        live: LiveTask | None = registry.load_task(content["task"]).live
         if live is None:
             raise UsageError(f"Models of the task {content['task']} do not run live.")
         common = content["settings"]
@@ -174,7 +174,7 @@ def parse_option(name: str, text: Any, annotation: Any) -> Any:
 
 def task_settings() -> dict[str, type[TaskSettings]]:
     """Return the settings dataclass of each task with live sessions, by task name."""
-    tasks = {name: registry.load_task(name).live for name in registry.tasks()}
+    tasks: dict[str, LiveTask | None] = {name: registry.load_task(name).live for name in registry.tasks()}
     return {name: live.settings for name, live in tasks.items() if live is not None}
 
 

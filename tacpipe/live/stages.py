@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import UsageError
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
+from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.store.records import Step
+from tacpipe.synchronization.placement import are_arrivals, equal_fraction
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
 from tacpipe.video.stream import read_format
 
+PIECE_NS = 1_000_000_000  # duration of the pieces in which a recording is replayed
 CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.difference": lambda params, place: DifferenceChannels(
         params.rows, params.columns, params.reference_frames, place
@@ -64,8 +68,6 @@ class RecordingInMemory:
 
     def columns(self, stream: str = "") -> Columns:
         """Return the columns of a stream, as those of a stored recording."""
-        from tacpipe.io.parquet import to_parquet
-
         return Columns(to_parquet(self.tables[stream]))
 
 
@@ -85,6 +87,31 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
             "original recordings; the model's own stages run on them."
         )
     return {name: recording.table(name) for name in recording.streams}
+
+
+def arrival_streams(recording: Recording, tables: Mapping[str, pa.Table]) -> list[str]:
+    """Return the names of the streams ``tables`` of a recording whose times are arrivals."""
+    return [
+        name
+        for name, table in tables.items()
+        if table.num_rows and are_arrivals(table.schema.field("t_ns"), recording.attributes, equal_fraction(table))
+    ]
+
+
+def pieces_by_arrival(tables: Mapping[str, pa.Table], master: str) -> Iterator[tuple[int, dict[str, pa.Table]]]:
+    """Yield recorded streams in pieces of `PIECE_NS` in the order of arrival, up to the last sample of ``master``.
+
+    Each piece has the time up to which it contains samples, and the new rows of each stream that has rows.
+    """
+    stamps = {name: table.column("t_ns").to_numpy() for name, table in tables.items() if table.num_rows}
+    if master not in stamps:
+        return
+    begins, last = min(int(t_ns[0]) for t_ns in stamps.values()), int(stamps[master][-1])
+    passed = dict.fromkeys(stamps, 0)
+    for until_ns in (*range(begins, last, PIECE_NS), last):
+        stops = {name: int(np.searchsorted(t_ns, until_ns, side="right")) for name, t_ns in stamps.items()}
+        yield until_ns, {name: tables[name].slice(passed[name], stop - passed[name]) for name, stop in stops.items()}
+        passed = stops
 
 
 def run_stages(recording: Recording, model: Dataset) -> Any:

@@ -117,13 +117,16 @@ class WebsocketPublisher:
         )
 
     async def _end(self) -> None:
-        """Close the server, and abort connections that do not close within `END_S`."""
+        """Close the server, and abort connections that do not close within `END_S`, such as unfinished handshakes."""
         self._server.close()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(END_S):
                 await self._server.wait_closed()
         for connection in self._connections:
             connection.transport.abort()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(END_S):
+                await self._server.wait_closed()  # the tasks of aborted connections end with the loop's next steps
 
     def _check_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return a refusal for a client without the token, the page for a browser, and None for a subscriber.

@@ -17,11 +17,12 @@ from tacpipe.engine import execution
 from tacpipe.errors import StorageError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
-from tacpipe.maintenance import cache, copying, pushed, transfer
-from tacpipe.maintenance.pushed import AnyStore
+from tacpipe.maintenance import copying, pushed, transfer
 from tacpipe.printable import plain
 from tacpipe.store import projects
+from tacpipe.store.cached import bucket_or_folder
 from tacpipe.store.location import locate
+from tacpipe.store.remote import AnyStore
 from tacpipe.store.roots import PUSHED, Root, WrittenManifest
 from tacpipe.store.store import MissingError
 
@@ -121,7 +122,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     store = locate()
     other_store = source
     if source is None and store.distant:
-        other_store = cache.bucket_or_folder(store)
+        other_store = bucket_or_folder(store)
     read_store = other_store or store
     manifest_digest = _manifest_digest(read_store, name)
     with store.at_work([manifest_digest]):

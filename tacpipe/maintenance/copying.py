@@ -11,11 +11,11 @@ from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError
 from tacpipe.io import terminal, threads
 from tacpipe.maintenance import garbage
-from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import layout, records
+from tacpipe.store.backend import ObjectBlocks
 from tacpipe.store.records import Record
-from tacpipe.store.remote import RemoteStore
+from tacpipe.store.remote import AnyStore, RemoteStore
 from tacpipe.store.store import MissingError
 
 
@@ -51,18 +51,15 @@ def _plan_copy(source: AnyStore, target: AnyStore, dataset: manifest_of.Found, *
     Raises `DamagedError` if a page of a manifest is invalid.
     """
     plan = _Plan()
-    todo, visited = [dataset.digest], set()
-    while todo:
-        name = todo.pop()
-        if name in visited:
-            continue
-        visited.add(name)
+
+    def read(name: str) -> Manifest | None:
         try:
-            manifest = dataset.manifest if name == dataset.digest else _manifest(source, target, name)
+            return dataset.manifest if name == dataset.digest else _manifest(source, target, name)
         except MissingError:
-            continue
+            return None
+
+    for name, manifest in garbage.walk([dataset.digest], read, max(source.at_once, target.at_once)):
         plan.manifests[name] = manifest.content
-        todo += garbage.ancestors(manifest)
         if ancestors or name == dataset.digest:
             _expect_valid_pages(manifest, name)
             plan.objects.update({digest: (path, size) for path, digest, size in manifest.contents()})
@@ -98,21 +95,16 @@ def copy(
     sizes = plan.sizes()
     target.announce(sizes)  # announced before the sizes are read, so that no collection removes an object in between
     present_sizes = target.sizes(sizes)
-    absent_objects = [name for name in plan.objects if present_sizes.get(name) != sizes[name]]
-    _expect_room(target, sum(sizes[name] for name in absent_objects))
-    absent_objects += _find_damaged(
-        target, [name for name in plan.objects if present_sizes.get(name) == sizes[name]], sizes, verify=verify
-    )
-    _send(source, target, plan, absent_objects, dataset_dirs)
-    target.settle(layout.object_name(name) for name in absent_objects)
-    absent_manifests = [name for name in plan.manifests if present_sizes.get(name) != sizes[name]]
-    absent_manifests += _find_damaged(
-        target, [name for name in plan.manifests if name not in absent_manifests], sizes, verify=verify
-    )
-    for name in absent_manifests:
-        target.take(name, [plan.manifests[name]])
-    target.settle(layout.object_name(name) for name in absent_manifests)
-    moved = {*absent_objects, *absent_manifests}
+    absent = {name for name in sizes if present_sizes.get(name) != sizes[name]}
+    _expect_room(target, sum(sizes[name] for name in absent & plan.objects.keys()))
+    moved: set[str] = set()
+    for names in (plan.objects, plan.manifests):
+        missing = [name for name in names if name in absent and name not in moved]
+        if verify:
+            missing += _find_damaged(target, [name for name in names if name not in absent], sizes)
+        _send(source, target, plan, missing, dataset_dirs)
+        target.settle(layout.object_name(name) for name in missing)
+        moved.update(missing)
     transferred.objects += len(moved)
     transferred.bytes += sum(sizes[name] for name in moved)
     transferred.there += len(sizes) - len(moved)
@@ -120,8 +112,8 @@ def copy(
     _copy_records(source, target, dataset, sizes, before)
 
 
-def _find_damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
-    """Return those of the objects ``names`` whose content does not match their digest; none unless ``verify`` is set."""
+def _find_damaged(target: AnyStore, names: Sequence[str], sizes: Mapping[str, int]) -> list[str]:
+    """Return those of the objects ``names`` whose content does not match their digest."""
 
     def is_sound(name: str) -> bool:
         try:
@@ -131,9 +123,8 @@ def _find_damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, in
             return False
         return True
 
-    checked = list(names) if verify else []
-    soundness = threads.map_in_threads(is_sound, checked, target.at_once)
-    return [name for name, sound in zip(checked, soundness, strict=True) if not sound]
+    soundness = threads.map_in_threads(is_sound, names, target.at_once)
+    return [name for name, sound in zip(names, soundness, strict=True) if not sound]
 
 
 def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], directories: tuple[str, ...]) -> None:
@@ -141,9 +132,12 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
     sizes = plan.sizes()
 
     def send(name: str) -> tuple[str, MissingError | None]:
+        if name in plan.manifests:
+            target.take(name, [plan.manifests[name]])
+            return name, None
         path, size = plan.objects[name]
         try:
-            target.take(name, _Counted(source, name, size, path))
+            target.take(name, ObjectBlocks(lambda: _check_size(source.blocks(name, size), size, path)))
         except MissingError as error:
             return name, error
         return name, None
@@ -194,16 +188,6 @@ def _manifest(source: AnyStore, target: AnyStore, name: str) -> Manifest:
         return manifest_of.stored(source, name)
     except MissingError:
         return manifest_of.stored(target, name)
-
-
-class _Counted:
-    """The blocks of an object, which can be iterated repeatedly. Raises the errors of `_check_size`."""
-
-    def __init__(self, source: AnyStore, name: str, size: int, path: str) -> None:
-        self._source, self._name, self._size, self._path = source, name, size, path
-
-    def __iter__(self) -> Iterator[bytes]:
-        return _check_size(self._source.blocks(self._name, self._size), self._size, self._path)
 
 
 def _check_size(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:

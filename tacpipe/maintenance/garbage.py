@@ -2,37 +2,39 @@
 
 Whether content is needed does not depend on a clock. A process announces an object before it checks that the object
 exists, and a collection moves objects aside before it reads the announcements. So at least one of the two notices the
-other.
+other. In a bucket, announcements that are `GRACE_DAYS` old by its clock are removed, and their commands end with an
+error; in a folder, the kernel releases the lease of a process that ended.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import DamagedError, DeniedError, StorageError, TacpipeError
-from tacpipe.io import regular
-from tacpipe.io.files import readable_errors
+from tacpipe.io import regular, threads
 from tacpipe.io.hashing import DIGEST
-from tacpipe.maintenance import unnamed
-from tacpipe.maintenance.sound_records import NOTES, RecordSummary, SoundPages, SoundRecords
-from tacpipe.store import layout, presence
+from tacpipe.maintenance import pushed, unnamed
+from tacpipe.store import layout, presence, projects
+from tacpipe.store.backend import Entry
+from tacpipe.store.cached import CachedStore
+from tacpipe.store.records import digests
+from tacpipe.store.remote import AnyStore
 from tacpipe.store.roots import PUSHED, Root
-from tacpipe.store.store import MissingError, Store
+from tacpipe.store.store import AbsentError, MissingError, Store
 
 log = logging.getLogger(__name__)
 GRACE_DAYS = 14.0  # how long roots with unreachable paths and files in quarantine are retained
 _DRAFT_S = 3600.0  # age in seconds above which a draft counts as abandoned
-_YOUNG_S = 60.0  # age in seconds below which files are not touched
 
 
 @dataclass
@@ -56,30 +58,39 @@ class LiveObjects:
     replaced: set[str] = field(default_factory=set)  # digests of the manifests with this content
     pages: set[str] = field(default_factory=set)  # digests of manifest pages among all these
     manifests: list[Manifest] = field(default_factory=list)  # manifests of recordings among all these
-    doubtful: set[Path] = field(default_factory=set)  # quarantined files that name objects which may be recordings
+    doubtful: set[str] = field(default_factory=set)  # quarantined files that name objects which may be recordings
     # names of running processes' leases, which are prefixes of their drafts
     runs: set[str] = field(default_factory=set)
 
 
-def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False) -> LiveObjects:
+class _RecordSummary(NamedTuple):
+    """The properties of a record that a collection needs; those of all records are in memory."""
+
+    names: str  # digests of shards and files
+    irreplaceable: bool  # True if no stage can compute the result again
+
+
+def live(
+    store: AnyStore, grace_days: float = GRACE_DAYS, *, dry_run: bool = False, lasting: bool = False
+) -> LiveObjects:
     """Return the objects of the store that are needed; with ``lasting``, also replaced ones that cannot be recomputed.
 
     Roots whose paths are missing are marked, unless ``dry_run``. Raises `DamagedError` if a root or the manifest of an
     ancestor is damaged, because the objects that it needs are then unknown.
     """
     needed, pending, replaced = LiveObjects(), [], []
-    for run in store.leases.runs():  # runs are read before roots: a run that ends in between has written its root
+    for run in store.runs():  # runs are read before roots: a run that ends in between has written its root
         needed.runs.add(run.path.stem)
         needed.objects |= run.objects
+        needed.objects.update(name for _, record in store.records(run.keys) for name in digests(record["result"]))
         pending += run.manifests
     datasets: dict[str, manifest_of.Found] = {}  # manifests in directories, by digest
-    walked: dict[str, set[str]] = {}  # digests in a page, by the page's digest
-    sound = SoundPages(store)
     for root in store.roots.all():
+        if root["kind"] == PUSHED:  # each push is a snapshot that is retained until it is forgotten
+            pending += pushed.manifests(root)
+            continue
         path = Path(root["path"])
-        manifest_bytes, reached = None, root["kind"] == PUSHED
-        if not reached:
-            manifest_bytes, reached = content(path)
+        manifest_bytes, reached = content(path)
         if manifest_bytes is not None:
             dataset = _sound(manifest_bytes, path)
             datasets[dataset.digest] = dataset
@@ -87,30 +98,34 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if manifest_bytes is None and not expired:
             pending.append(root["manifest"])
-        if root["kind"] == PUSHED:  # each push is a snapshot that is retained until it is forgotten
-            pending += [entry["manifest"] for entry in root.get("history", [])]
-        elif lasting:
+        if lasting:
             replaced += [entry["manifest"] for entry in root.get("history", []) if entry["lasting"]]
             replaced += (
                 [root["manifest"]] if manifest_bytes is None and expired and _lasting(store, root["manifest"]) else []
             )
-    damaged = store.roots.damaged()
-    if damaged:
-        raise DamagedError(
-            f"{len(damaged)} roots of {store.root} are damaged, so it is not known which datasets are needed; nothing was "
-            f"removed. `tacpipe store repair` restores those next to the store, and rerunning the commands restores "
-            f"the others. To give up a dataset, remove its quarantine/root-{damaged[0][:12]}…"
-        )
+    _refuse_damaged_roots(store)
+    walk = _ManifestWalk(store, datasets)
     doubtful = _doubtful(store)
     needed.doubtful = set(doubtful)
-    needed.objects |= _closure(store, pending, datasets, walked, sound, needed.manifests).union(*doubtful.values())
-    needed.lasting = _closure(store, list(replaced), datasets, walked, sound, needed.manifests) - needed.objects
-    needed.pages, needed.replaced = set(walked), set(replaced)
-    sound.remember()
+    needed.objects |= walk.reached(pending).union(*doubtful.values())
+    needed.lasting = walk.reached(replaced) - needed.objects
+    needed.pages, needed.replaced, needed.manifests = set(walk.pages), set(replaced), walk.recorded
     return needed
 
 
-def _lasting(store: Store, name: str) -> bool:
+def _refuse_damaged_roots(store: AnyStore) -> None:
+    """Raise `DamagedError` if a root is damaged, because the datasets that it names are then unknown."""
+    damaged = store.roots.damaged()
+    if damaged:
+        file = f"quarantine/root-{damaged[0][:12]}…" if isinstance(store, Store) else f"roots/{damaged[0]}/"
+        raise DamagedError(
+            f"{len(damaged)} roots of {store.place} are damaged, so it is not known which datasets are needed; nothing was "
+            f"removed. `tacpipe store repair` restores those next to the store, and rerunning or pushing the datasets "
+            f"again restores the others. To give up a dataset, remove its {file}"
+        )
+
+
+def _lasting(store: AnyStore, name: str) -> bool:
     """Return whether a manifest without a directory contains recordings or labels that cannot be recomputed."""
     try:
         manifest = manifest_of.stored(store, name)
@@ -119,28 +134,50 @@ def _lasting(store: Store, name: str) -> bool:
     return replacing.lasting(manifest)
 
 
-def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
+def collect(store: AnyStore, *, dry_run: bool, recordings: bool = False, grace_days: float = GRACE_DAYS) -> Collected:
     """Remove unneeded content, records before their objects; with ``dry_run``, only count it.
+
+    For a store in a bucket, this is content of the bucket. First, datasets that commands of this computer wrote are
+    forgotten there if their directories have been missing for the whole grace period.
 
     Only names of the store's own form are considered, and symbolic links are not followed. If this user may not read a
     file, no object is removed, because the file may name it. Raises `LockedError` if
     another collection runs, `DamagedError` as `live` does, and `UsageError` for a folder that is not a store.
     """
+    if isinstance(store, CachedStore):
+        for root in [] if dry_run else store.roots.all():
+            _forget_deleted(store, root, grace_days)
+        store = store.bucket
     if not store.check():
         return Collected()
-    with store.leases.exclusive("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
-        if not dry_run:
-            _put_back(store)
+    with store.collecting(grace_days, dry_run=dry_run):
         return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
 
 
-def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    """Collect garbage as `collect` does, within its lock. Raises `DamagedError` as `live` does."""
+def _forget_deleted(store: CachedStore, root: Root, grace_days: float) -> None:
+    """Forget a dataset of this computer in the bucket if its directory has been missing for the whole grace period."""
+    existing, reached = content(Path(root["path"]))
+    if existing is not None or not has_expired(store, root, grace_days, reached=reached, dry_run=False):
+        return
+    folder, name = projects.place(Path(root["path"]))
+    owner = projects.identity_of(store, folder)
+    pushed_root = None if owner is None else store.bucket.roots.pushed(name, owner.id)
+    if pushed_root is not None and pushed_root.get("output") and pushed_root["manifest"] == root["manifest"]:
+        store.bucket.roots.remove(pushed_root)
+        store.roots.remove(root)
+
+
+def _collect(store: AnyStore, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
+    """Collect garbage as `collect` does, within its block. Raises `DamagedError` as `live` does."""
     # records are read before `live`, because damaged ones go to quarantine, which `live` reads
-    records = _summaries(store)
+    records = {
+        key: _RecordSummary(" ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable")))
+        for key, record in store.records()
+    }
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
-    retained, unneeded = set(needed.lasting), []
+    retained: set[str] = set(needed.lasting)
+    unneeded: dict[str, set[str]] = {}  # digests by key of the record
     for key, summary in records.items():
         names = set(summary.names.split())
         if names <= needed.objects or names <= retained:
@@ -148,154 +185,139 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         if summary.irreplaceable and not recordings:
             retained |= names - needed.objects
             continue
-        unneeded.append(key)
+        unneeded[key] = names
     retained |= needed.objects
     objects = [name for name in store.names("objects") if name not in retained]
     named_by = {} if recordings else unnamed.irreplaceable(store, objects, needed.manifests)
     retained = retained.union(named_by, *named_by.values())
-    collected.records = sum(_remove_record(store.record_path(key), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(retained - needed.objects - needed.replaced - needed.pages - set(named_by))
-    moved_names = []
     if store.denied:
         log.warning("tacpipe: No object is removed, because it may be named in one of the files that cannot be read.")
         objects = []
-    for name in (name for name in objects if name not in retained):
-        path = store.object_path(name)
-        if _young(path):
-            continue
-        if dry_run:
-            _count(collected, path)
-        else:
-            with contextlib.suppress(FileNotFoundError):
-                os.rename(path, store.aside_path(name))  # noqa: PTH104
-                moved_names.append(name)
-    if moved_names:
-        root_manifests = {root["manifest"] for root in store.roots.all()}
-        moved_names.sort(
-            key=lambda name: name not in root_manifests
-        )  # manifests of roots are moved before their objects
-        live_objects = live(store, grace_days).objects
-        _remove(store, moved_names, live_objects.union(moved_names if store.denied else ()), collected)
+    entries = store.entries(name for name in objects if name not in retained)
+    surplus = {name: entry for name, entry in entries.items() if not _is_young(store, entry)}
+    if store.young_s:
+        stats = {key: store.files.stat(layout.record_name(key)) for key in unneeded}
+        unneeded = {key: names for key, names in unneeded.items() if not _is_young(store, stats[key])}
+    if dry_run:
+        collected.records = len(unneeded)
+    else:
+        surplus = _remove(store, surplus, unneeded, collected, grace_days)
+    collected.objects, collected.bytes = len(surplus), sum(entry.bytes for entry in surplus.values())
     _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
 
 
-def _summaries(store: Store) -> dict[str, RecordSummary]:
-    """Return the summary of each record that is sound, by its key."""
-    sound, summaries = SoundRecords(store), {}
-    for key in store.names("records"):
-        with contextlib.suppress(MissingError):
-            summaries[key] = sound.read(key)
-    sound.remember()
-    return summaries
+def _is_young(store: AnyStore, entry: Entry | None) -> bool:
+    """Return whether a file was just written, even if the clock has been set since, or does not exist any more."""
+    return entry is None or abs(time.time() - entry.changed_s) < store.young_s
 
 
-def _remove(store: Store, moved_names: list[str], needed: set[str], collected: Collected) -> None:
-    """Remove the objects that were moved aside, except those that are needed again."""
-    for name in moved_names:
-        if name in needed:
-            store.has(name)  # `has` moves the object back
-            continue
-        path = store.aside_path(name)
-        _count(collected, path)
-        Path(path).unlink(missing_ok=True)
+def _remove(
+    store: AnyStore,
+    surplus: Mapping[str, Entry],
+    records: Mapping[str, set[str]],
+    collected: Collected,
+    grace_days: float,
+) -> dict[str, Entry]:
+    """Move objects aside, determine again which are needed, and remove and return the others, after their records."""
+    root_manifests = {root["manifest"] for root in store.roots.all()}
+    moved = store.set_aside(sorted(surplus, key=lambda name: name not in root_manifests))  # manifests of roots first
+    needed = live(store, grace_days).objects if surplus or records else set()
+    if store.denied:
+        needed |= set(moved)
+    store.put_back([name for name in moved if name in needed])
+    removed_keys = [layout.record_name(key) for key, names in records.items() if not names <= needed]
+    collected.records = sum(1 for _ in threads.map_in_threads(store.files.delete, removed_keys, store.at_once))
+    removed = [name for name in moved if name not in needed]
+    store.discard(removed)
+    return {name: surplus[name] for name in removed}
 
 
-def _put_back(store: Store) -> None:
-    """Put back the objects that a killed collection moved aside."""
-    for path in layout.entries(store.root, "tmp"):
-        if path.name.startswith(layout.ASIDE) and store.has(path.name.removeprefix(layout.ASIDE)):
-            path.unlink(missing_ok=True)
+def walk(names: Iterable[str], read: Callable[[str], Manifest | None], at_once: int) -> Iterator[tuple[str, Manifest]]:
+    """Yield manifests and all of their ancestors with their digests, each once, as returned by ``read``.
 
-
-def _count(collected: Collected, path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):  # a process put it back, or another collection removed it
-        collected.bytes += os.stat(path).st_size  # noqa: PTH116
-        collected.objects += 1
-
-
-def _young(path: str) -> bool:
-    """Return whether a file was just written, even if the clock has been set since."""
-    with contextlib.suppress(FileNotFoundError):
-        return abs(time.time() - os.stat(path).st_mtime) < _YOUNG_S  # noqa: PTH116
-    return True
-
-
-def _remove_record(path: str, *, dry_run: bool) -> bool:
-    """Remove a record that is not young, unless ``dry_run``; return whether there was such a record."""
-    if _young(path):
-        return False
-    if not dry_run:
-        Path(path).unlink(missing_ok=True)
-    return True
-
-
-def _closure(
-    store: Store,
-    pending: list[str],
-    datasets: Mapping[str, manifest_of.Found],
-    walked: dict[str, set[str]],
-    sound: SoundPages,
-    recording_manifests: list[Manifest],
-) -> set[str]:
-    """Return the digests of manifests, of their ancestors, and of all their objects.
-
-    Adds manifests of recordings to ``recording_manifests``. Pages in ``walked`` are not read again. Raises
-    `DamagedError` if something that is needed to determine this is damaged, such as a page of a manifest in a
-    directory.
+    The ancestors of those for which ``read`` returns None are left out. ``at_once`` manifests are read concurrently.
     """
-    objects: set[str] = set()
-    manifests: set[str] = set()
+    pending, visited = {*names}, set[str]()
     while pending:
-        name = pending.pop()
-        if name in manifests:
-            continue
-        manifests.add(name)
+        todo = sorted(pending)
+        visited |= pending
+        pending = set()
+        for name, manifest in zip(todo, threads.map_in_threads(read, todo, at_once), strict=True):
+            if manifest is not None:
+                yield name, manifest
+                pending |= {*manifest.ancestors} - visited
+
+
+class _ManifestWalk:
+    """The walk from manifests to everything that these and their ancestors need."""
+
+    def __init__(self, store: AnyStore, datasets: Mapping[str, manifest_of.Found]) -> None:
+        self.pages: dict[str, set[str]] = {}  # digests in each page that was read, by the page's digest
+        self.recorded: list[Manifest] = []  # manifests of recordings
+        self._store, self._datasets = store, datasets
+
+    def reached(self, pending: list[str]) -> set[str]:
+        """Return the digests of manifests, of their ancestors, and of all their objects.
+
+        Raises `DamagedError` if something that is needed to determine this is damaged, such as a page of a manifest in a
+        directory.
+        """
+        objects = {*pending}
+        for name, manifest in walk(pending, self._read, self._store.at_once):
+            objects |= {name, *manifest.ancestors, *manifest.reached(self.pages)}
+            self.recorded += [manifest] if manifest.recorded else []
+        return objects
+
+    def _read(self, name: str) -> Manifest | None:
+        """Return a manifest whose pages were read, or None if it was never stored here."""
+        store = self._store
         try:
-            manifest = datasets[name].manifest if name in datasets else manifest_of.stored(store, name)
-            objects |= manifest.reached(walked, read=sound.names)
+            manifest = self._datasets[name].manifest if name in self._datasets else manifest_of.stored(store, name)
+            manifest.reached(self.pages)
+            return manifest
         except StorageError:  # the disk failed or memory is short, so the manifest's content is unknown
             raise
         except TacpipeError as error:
-            # the manifest existed here once; if something is denied, no object is removed
-            if not store.denied and (name in datasets or store.quarantined(name) or store.has(name)):
-                raise DamagedError(
-                    f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
-                    "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
-                    "continue without it, remove it from objects/ and quarantine/."
-                ) from error
-            continue  # it never existed here: a dataset was copied or pulled without its ancestors
-        pending += ancestors(manifest)
-        recording_manifests += [manifest] if manifest.recorded else []
-    return objects | manifests
+            if isinstance(error, AbsentError) and not _is_quarantined(store, name):
+                return None  # it never existed here: a dataset was copied or pulled without its ancestors
+            if store.denied:  # no object is removed
+                return None
+            raise DamagedError(
+                f"{error} The manifest {name[:12]}, which something in {store.place} descends from, is damaged, so it is "
+                "not known what it needs; nothing was removed. `tacpipe store repair`, or `tacpipe store push --verify` "
+                "from where it is sound, may bring it back; to continue without it, remove it from objects/ and "
+                "quarantine/."
+            ) from error
 
 
-def _doubtful(store: Store) -> dict[Path, set[str]]:
-    """Return the digests in damaged records and manifests, which may be those of recordings.
+def _is_quarantined(store: AnyStore, name: str) -> bool:
+    return any(entry.name.startswith(f"quarantine/{name}.") for entry in store.files.list("quarantine"))
+
+
+def _doubtful(store: AnyStore) -> dict[str, set[str]]:
+    """Return the digests in damaged records and manifests, which may be those of recordings, by their quarantined file.
 
     Digests that were recomputed or restored are not included.
     """
-    names_by_path = {}
-    for path in layout.entries(store.root, "quarantine"):
-        name, _, kind = path.name.rpartition(".")[0].partition(".")
+    names_by_file = {}
+    for entry in store.files.list("quarantine"):
+        name, _, kind = Path(entry.name).name.rpartition(".")[0].partition(".")
         if not DIGEST.fullmatch(name) or (store.record(name) if kind else store.has(name)):
             continue
         try:
-            with readable_errors(store.root, reading=True):
-                names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
+            names = unnamed.digests(store.files.read(entry.name, regular.JSON_BYTES))
             if names:
-                names_by_path[path] = names | unnamed.named_by_pages(store, names)
+                names_by_file[entry.name] = names | unnamed.named_by_pages(store, names)
         except (FileNotFoundError, regular.IrregularError):  # a larger file was a shard
             continue
         except DeniedError as error:
-            names_by_path[path] = set()
-            store.note_denied(f"quarantine/{path.name}", error)
-    return names_by_path
-
-
-def ancestors(manifest: manifest_of.Manifest) -> list[str]:
-    """Return the digests of the manifests that this one was computed from."""
-    return [reference["manifest"] for references in manifest.inputs.values() for reference in references]
+            if not isinstance(store, Store):
+                raise
+            names_by_file[entry.name] = set()
+            store.note_denied(entry.name, error)
+    return names_by_file
 
 
 def content(path: Path) -> tuple[bytes | None, bool]:
@@ -327,7 +349,7 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
     return dataset
 
 
-def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
+def has_expired(store: AnyStore, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been unreachable for the whole grace period.
 
     The first failed access starts the period, and a successful one resets it. A clock from before the root was written
@@ -348,38 +370,34 @@ def has_expired(store: Store, root: Root, grace_days: float, *, reached: bool, d
 
 
 def _sweep(
-    store: Store, needed: LiveObjects, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
+    store: AnyStore, needed: LiveObjects, collected: Collected, grace_days: float, *, dry_run: bool, doubtful: bool
 ) -> None:
-    """Remove old drafts, leases of ended runs, checkpoints of stored results, and notes of directories.
+    """Remove files that were quarantined ``grace_days`` ago or earlier, and the remains of ended runs in a folder.
 
-    Files that were quarantined ``grace_days`` ago or earlier are removed, but those that may contain recordings only if
-    ``doubtful``. With ``dry_run``, drafts and checkpoints are only counted.
+    Quarantined files that may contain recordings are removed only if ``doubtful``. With ``dry_run``, drafts and
+    checkpoints are only counted.
     """
     now_s = time.time()
-    for path in layout.entries(store.root, "tmp"):
-        if path.name.startswith(layout.ASIDE) or path.name.partition(".")[0] in needed.runs:
+    for entry in [] if dry_run else list(store.files.list("quarantine")):
+        old = abs(now_s - int(entry.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400
+        if old and (doubtful or entry.name not in needed.doubtful):
+            store.files.delete(entry.name)
+    if not isinstance(store, Store):
+        return
+    for entry in list(store.files.list("tmp")):
+        name = Path(entry.name).name
+        if name.startswith(layout.ASIDE) or name.partition(".")[0] in needed.runs:
             continue
-        # the run of such a draft has ended; a draft without a run is removed when it is old
-        dead = path.name.startswith("run-")
-        with contextlib.suppress(FileNotFoundError):
-            old = abs(now_s - path.stat().st_mtime) >= (_YOUNG_S if dead else _DRAFT_S)
-            collected.drafts += old and _drop(path, dry_run=dry_run)
-    for path in layout.entries(store.root, "quarantine"):
-        # whether it was quarantined long enough ago
-        old = abs(now_s - int(path.name.rpartition(".")[2]) / 1e9) >= grace_days * 86400
-        if old and (doubtful or path not in needed.doubtful):
-            _drop(path, dry_run=dry_run)
+        # the run of a draft with a run's name has ended; a draft without a run is removed when it is old
+        if abs(now_s - entry.changed_s) >= (store.young_s if name.startswith("run-") else _DRAFT_S):
+            collected.drafts += 1
+            if not dry_run:
+                store.files.delete(entry.name)
     if not dry_run:
         store.leases.sweep()
-        presence.forget_notes(store, [*NOTES, *(path.stem for path in layout.entries(store.root, "roots"))])
+        presence.forget_notes(store, [path.stem for path in layout.entries(store.root, "roots")])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1
             if not dry_run:
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _drop(path: Path, *, dry_run: bool) -> bool:
-    if not dry_run:
-        path.unlink()
-    return True

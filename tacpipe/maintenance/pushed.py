@@ -15,11 +15,9 @@ from tacpipe.datasets import replacing
 from tacpipe.errors import UsageError
 from tacpipe.printable import listed
 from tacpipe.store.projects import Project
-from tacpipe.store.remote import RemoteStore
+from tacpipe.store.remote import AnyStore
 from tacpipe.store.roots import PUSHED, Root, WrittenManifest, project_id
-from tacpipe.store.store import Store
 
-AnyStore = Store | RemoteStore
 MIN_DIGITS = 6  # minimum number of digits that identify a project or a manifest
 _SHOWN_DIGITS = 8  # digits of a project's id, shown if several projects have its name
 _SHOWN = 20  # number of datasets listed before the others are counted
@@ -155,7 +153,7 @@ def forget(store: AnyStore, requested: str, *, dry_run: bool = False) -> bool:
     At least `MIN_DIGITS` digits are required. Returns whether there was one. Raises `UsageError` if several match.
     """
     all_roots = roots(store)
-    matching = _roots_of_project(requested, all_roots) or [root for root in all_roots if root["path"] == requested]
+    matching = _roots_of_project(requested, all_roots) or _roots_of_name(requested, all_roots, None)
     if len(matching) > 1:
         names = listed((label(root, all_roots) for root in matching), _SHOWN)
         raise UsageError(f"{store.place} keeps several datasets {requested}: {names}. Give one of these names.")

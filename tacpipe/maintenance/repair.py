@@ -1,70 +1,30 @@
-"""Show the content of a store, verify it, and repair it."""
+"""Verify a store, and repair it."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
 import time
 import uuid
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypedDict
 
-from tacpipe import printable
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.delivery import deliver
 from tacpipe.engine import execution
-from tacpipe.errors import DeniedError, StorageError, TacpipeError
-from tacpipe.io import regular
-from tacpipe.io.files import read_error, readable_errors, walk, write_whole
-from tacpipe.io.hashing import file_digest
-from tacpipe.maintenance.sound_records import SoundPages, SoundRecords
+from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.io import terminal, threads
+from tacpipe.io.files import walk, write_whole
+from tacpipe.io.hashing import DIGEST, file_digest
 from tacpipe.printable import plain
-from tacpipe.store import layout
-from tacpipe.store.leases import Holder
+from tacpipe.store.cached import CachedStore, bucket_or_folder
 from tacpipe.store.location import locate
+from tacpipe.store.remote import AnyStore, RemoteStore
 from tacpipe.store.roots import PUSHED, Root
 from tacpipe.store.store import AbsentError, MissingError, Store, UnreadableError
 
 _SHOWN = 10  # number of foreign files listed before the others are counted
-_Measured = Literal["objects", "records", "quarantine", "tmp", "checkpoints"]
-# folders that the status lists
-_MEASURED: tuple[_Measured, ...] = ("objects", "records", "quarantine", "tmp", "checkpoints")
-
-
-class FolderSize(TypedDict):
-    """The number and size of files in a folder of a store."""
-
-    files: int
-    bytes: int
-
-
-class RootStatus(Root):
-    """A root, and whether its path can be reached."""
-
-    reachable: bool
-
-
-class StoreStatus(TypedDict):
-    """The location and content of a store."""
-
-    store: str
-    there: bool
-    objects: FolderSize
-    records: FolderSize
-    tmp: FolderSize
-    roots: list[RootStatus]
-    running: list[Holder]  # active runs
-
-
-class FolderStatus(StoreStatus):
-    """The status of a store in a folder."""
-
-    quarantine: FolderSize
-    checkpoints: FolderSize
 
 
 @dataclass
@@ -120,26 +80,26 @@ class Soundness:
         return "\n".join(lines)
 
 
-def verify(store: Store) -> Soundness:
-    """Return the soundness of every object and record, moving damaged ones to quarantine.
+def verify(store: AnyStore) -> Soundness:
+    """Return the soundness of every object, record and root.
 
-    Objects that disappear between listing and reading were removed by a collection and are not counted. Raises
-    `UsageError` for a folder that is not a store.
+    In a folder, damaged files are moved to quarantine; in a bucket, nothing is changed, but damaged files of its local
+    cache are removed first. Objects that disappear between listing and reading were removed by a collection and are
+    not counted. Raises `UsageError` for a folder that is not a store.
     """
+    if isinstance(store, CachedStore):
+        _verify(store)  # a damaged object of the cache is fetched again when it is read, so it is not counted
+    return _verify(bucket_or_folder(store))
+
+
+def _verify(store: AnyStore) -> Soundness:
     if not store.check():
         return Soundness(there=False)
-    soundness = Soundness(foreign=layout.foreign(store.root))
-    present = {
-        name
-        for name in store.names("objects")
-        if regular.small_file_digest(store.object_path(name)) == name or _read(store.read, name, soundness)
-    }
+    soundness = Soundness(foreign=store.foreign())
+    present = _read_all(store, store.verify, list(store.names("objects")), soundness)
     soundness.objects = len(present)
-    sound = SoundRecords(store)
-    for key in store.names("records"):
-        soundness.records += _read(sound.read, key, soundness)
-    sound.remember()
-    store.roots.all()
+    soundness.records = len(_read_all(store, store.read_record, list(store.names("records")), soundness))
+    store.roots.all()  # moves damaged roots of a folder to quarantine
     soundness.damaged += [f"root {name}" for name in store.roots.damaged()]
     missing = set(_absent_objects(store, soundness, present)) - set(soundness.damaged)
     # checked twice, because a root may change in between
@@ -148,39 +108,70 @@ def verify(store: Store) -> Soundness:
     return soundness
 
 
-def _read(read: Callable[[str], object], name: str, soundness: Soundness) -> bool:
-    """Return whether there was something to read; note its name if it was damaged or the disk failed."""
-    try:
-        read(name)
-    except AbsentError:
-        return False
-    except UnreadableError as error:
-        soundness.unread[name] = str(error)
-    except MissingError:
-        soundness.damaged.append(name)
-    except StorageError as error:
-        soundness.unread[name] = str(error)
-    return True
+def _read_all(store: AnyStore, read: Callable[[str], object], names: Sequence[str], soundness: Soundness) -> set[str]:
+    """Read objects or records, and return those that exist; note which are damaged and which the disk failed to read."""
+
+    def attempt(name: str) -> TacpipeError | None:
+        try:
+            read(name)
+        except (MissingError, StorageError) as error:
+            if isinstance(error, StorageError) and not isinstance(store, Store):
+                raise  # the connection failed, which concerns all names
+            return error
+        return None
+
+    present = set(names)
+    with terminal.progress_bar("verifying", len(names)) as advance:
+        for name, error in zip(names, threads.map_in_threads(attempt, names, store.at_once), strict=True):
+            if isinstance(error, AbsentError):
+                present.remove(name)
+            elif isinstance(error, UnreadableError | StorageError):
+                soundness.unread[name] = str(error)
+            elif error is not None:
+                soundness.damaged.append(name)
+            advance()
+    return present
 
 
 def repair(store: Store) -> Soundness:
-    """Restore missing objects from dataset directories or by recomputing them, and return the store's new soundness."""
-    if not store.check():
+    """Restore what is damaged or missing from dataset directories or by recomputing it; return the new soundness.
+
+    A damaged object of a bucket is moved to quarantine there. Objects that this computer cannot restore are reported as
+    lost. A damaged record stays until a command computes its key.
+    """
+    main_store = bucket_or_folder(store)
+    if not main_store.check():
         return Soundness(there=False)
     with store.at_work():
         soundness = verify(store)
+        damaged: dict[str, str] = {}
+        for name in soundness.damaged if isinstance(main_store, RemoteStore) else ():
+            if DIGEST.fullmatch(name) and main_store.has(name):
+                main_store.quarantine(name)
+                damaged[name] = name[:12]
         soundness.repaired += _rewrite_roots(store)
         roots = store.roots.all()
         soundness.repaired += [name for root in roots for name in _rewrite_manifest(store, root)]
-        datasets = [dataset for dataset in (_find(root) for root in roots) if dataset is not None]
-        for dataset in datasets:
-            if not store.has(dataset.digest):
+        for dataset in (_find(root) for root in roots):
+            if dataset is not None and not store.has(dataset.digest):
                 dataset.manifest.keep(store)
-                soundness.repaired.append(dataset.digest)
-        paths_by_digest = _absent_objects(store, soundness)
+                soundness.repaired += (
+                    [dataset.digest] if main_store is store else []
+                )  # else it is sent to the bucket below
         read = execution.reader(store, tuple(root["path"] for root in roots))
-        for name, path in sorted(paths_by_digest.items()):
-            soundness.note_repair(name, functools.partial(read, name, path))
+
+        def restore(name: str, path: str) -> None:
+            read(name, path)
+            if isinstance(store, CachedStore):
+                store.send([name])
+
+        absent, tried = damaged | _absent_objects(main_store, soundness), set[str]()
+        while absent:
+            for name, path in sorted(absent.items()):
+                soundness.note_repair(name, functools.partial(restore, name, path))
+            tried |= absent.keys()
+            named = _absent_objects(main_store, soundness)  # restored manifests name more objects
+            absent = {name: path for name, path in named.items() if name not in tried}
         soundness.missing = []
     return soundness
 
@@ -258,64 +249,6 @@ def link(path: Path) -> int:
     return len(stale)
 
 
-def status(store: Store) -> FolderStatus:
-    """Return the location of the store, number and size of its files, its roots and active runs."""
-    return {
-        "store": str(store.root),
-        "there": store.check(),
-        "objects": _measure_folder(store, "objects"),
-        "records": _measure_folder(store, "records"),
-        "quarantine": _measure_folder(store, "quarantine"),
-        "tmp": _measure_folder(store, "tmp"),
-        "checkpoints": _measure_folder(store, "checkpoints"),
-        "roots": [{**root, "reachable": _reachable(root)} for root in store.roots.all()],
-        "running": [run.note for run in store.leases.runs()],
-    }
-
-
-def _measure_folder(store: Store, name: _Measured) -> FolderSize:
-    """Return number and size of the files in a folder of the store.
-
-    Files that disappear meanwhile and those in folders that this user may not list are not counted.
-    """
-    sizes = []
-
-    def note_denied(error: OSError) -> None:
-        if not isinstance(error, FileNotFoundError):
-            failure = read_error(error.filename, error)
-            if not isinstance(failure, DeniedError):
-                raise failure
-            store.note_denied(os.path.relpath(error.filename, store.root), failure)
-
-    with readable_errors(store.root, reading=True):
-        for folder, _, files in os.walk(store.root / name, onerror=note_denied):
-            for file in files:
-                with contextlib.suppress(FileNotFoundError):
-                    sizes.append(os.lstat(f"{folder}/{file}").st_size)
-    return {"files": len(sizes), "bytes": sum(sizes)}
-
-
-def _reachable(root: Root) -> bool:
-    try:
-        return root["kind"] == PUSHED or Path(root["path"]).exists()
-    except OSError:  # a parent folder may not be accessible
-        return False
-
-
-def status_text(value: FolderStatus) -> str:
-    """Return the status as text, one line per folder, root and active run."""
-    lines = [value["store"] if value["there"] else f"{value['store']}: there is no store yet"]
-    lines += [
-        f"  {name:<12} {value[name]['files']:>8} files {value[name]['bytes'] / 1e6:>10.1f} MB" for name in _MEASURED
-    ]
-    lines += [
-        f"  root  {root['manifest'][:12]}  {root['path']}" + ("" if root["reachable"] else "  (cannot be reached)")
-        for root in value["roots"]
-    ]
-    lines += [f"  at work: process {note.get('pid')} on {note.get('host')}" for note in value["running"]]
-    return printable.lines(lines)
-
-
 def _find(root: Root) -> manifest_of.Found | None:
     """Return the manifest at a root's path, or None if there is no valid, readable one."""
     return None if root["kind"] == PUSHED else _sound(Path(root["path"]))
@@ -331,30 +264,34 @@ def _sound(directory: Path) -> manifest_of.Found | None:
     return dataset
 
 
-def _absent_objects(store: Store, soundness: Soundness, present: Collection[str] = ()) -> dict[str, str]:
+def _absent_objects(store: AnyStore, soundness: Soundness, present: Collection[str] = ()) -> dict[str, str]:
     """Return the paths of missing objects that roots need, by digest: manifests, and everything in those at the paths.
 
     Objects that the system fails to read or to find are noted in ``soundness``. Those in ``present`` were just read.
     Objects that this user may not read are left out.
     """
-    paths_by_digest, sound = {}, SoundPages(store)
+    paths: dict[str, str] = {}
     for root in store.roots.all():
         dataset = _find(root)
-        if root["kind"] == PUSHED and not store.has(root["manifest"]):
-            paths_by_digest[root["manifest"]] = manifest_of.NAME
-            continue
         try:
             manifest = manifest_of.stored(store, root["manifest"]) if dataset is None else dataset.manifest
-            if not store.has(manifest.content_digest):
-                paths_by_digest[manifest.content_digest] = manifest_of.NAME
-            absent = [] if manifest.pages is None else manifest.pages.missing(store.has)
-            paths_by_digest.update({page.digest: page.path for page in absent})
-            names = manifest.reached({}, read=sound.names)
-            if not all(name in present or store.has(name) for name in names):
-                paths_by_digest.update({name: path for path, name in manifest.objects() if not store.has(name)})
+            paths[manifest.content_digest] = manifest_of.NAME
+            if manifest.pages is not None:
+                paths.update({page.digest: page.path for page in manifest.pages.pages})
+            paths.update({name: path for path, name in manifest.objects()})
         except StorageError as error:
             soundness.unread[root["manifest"]] = str(error)
+        except AbsentError:
+            if root["kind"] == PUSHED:
+                paths[root["manifest"]] = manifest_of.NAME
         except TacpipeError:
             continue
-    sound.remember()
-    return {name: path for name, path in paths_by_digest.items() if name not in store.denied}
+    unseen = [name for name in paths if name not in present]
+    try:
+        existing = store.sizes(unseen)
+    except StorageError as error:
+        if not isinstance(store, Store):
+            raise  # the connection failed, which concerns all names
+        soundness.unread["objects"] = str(error)
+        return {}
+    return {name: paths[name] for name in unseen if name not in existing and name not in store.denied}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import directory as directory_of
@@ -15,14 +16,13 @@ from tacpipe.io.files import may_not_write
 from tacpipe.io.hashing import digest
 from tacpipe.maintenance import copying, pushed
 from tacpipe.maintenance.copying import Transferred
-from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
-from tacpipe.store import addresses, layout, projects
+from tacpipe.store import addresses, projects
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.location import locate
 from tacpipe.store.projects import Project
-from tacpipe.store.remote import RemoteStore
-from tacpipe.store.roots import Root, RootProject, project_id
+from tacpipe.store.remote import AnyStore, RemoteStore
+from tacpipe.store.roots import Root, RootProject
 from tacpipe.store.store import Store
 
 _LOOKS = 100  # maximum number of attempts if other pushes of the same name come first
@@ -39,23 +39,10 @@ def named_store(remote: Path | str) -> AnyStore:
 def remote_store(remote: Path | str) -> AnyStore:
     """Return the existing store at a path or an address, for reading. Raises `UsageError` if there is none."""
     store = named_store(remote)
-    if isinstance(store, RemoteStore):
-        if not store.check():
-            raise UsageError(
-                f"{remote} is not a store: it has no `format`. Give an address that `store push` wrote to."
-            )
-        return store
-    try:
-        store.files.read(layout.MARK, regular.BLOCK_BYTES)
-    except (FileNotFoundError, StorageError) as error:
-        if isinstance(error, StorageError) and not isinstance(error.__cause__, NotADirectoryError):
-            raise
+    if not store.check():
         raise UsageError(
-            f"{remote} is not a store: it has no file `format`. Give a directory that `store push` wrote."
-        ) from None
-    except regular.IrregularError as error:
-        raise UsageError(f"{remote} is not a store: {error}") from None
-    store.prepare()  # raises an error if the store has another format
+            f"{remote} is not a store: it has no `format`. Give a directory or address that `store push` wrote."
+        )
     return store
 
 
@@ -89,9 +76,10 @@ def push(
             owner = projects.identify(local_store, folder, writable=writable)
             if writable:
                 replacing.keep_replaced(local_store, dataset.directory.absolute())
+            name_push = _NamePush(target, local_store, dataset, owner, name, replace=replace)
             lock = digest(["pushed", owner.id, name])
             with target.exclusively(lock, f"the pushed dataset {name}"):
-                before = _predecessor(target, local_store, dataset, owner, name, replace=replace)
+                before = name_push.predecessor()
                 copying.copy(
                     local_store,
                     target,
@@ -102,15 +90,10 @@ def push(
                     verify=verify,
                     before="" if before is None else before["manifest"],
                 )
-                _publish_name(target, local_store, dataset, owner, name, before, replace=replace)
+                root = name_push.publish(before)
             if writable:
                 local_store.roots.note_pushed(dataset.directory.absolute(), dataset.digest)
-        pushed_roots = pushed.roots(target)
-        transferred.datasets += [
-            pushed.label(root, pushed_roots)
-            for root in pushed_roots
-            if project_id(root) == owner.id and root["path"] == name
-        ]
+        transferred.datasets.append(pushed.label(root, pushed.roots(target)))
     return transferred
 
 
@@ -176,58 +159,53 @@ def _announce_read(store: Store, manifest: str) -> Iterator[bool]:
             ) from error
 
 
-def _publish_name(
-    target: AnyStore,
-    local_store: Store,
-    dataset: manifest_of.Found,
-    owner: Project,
-    name: str,
-    before: Root | None,
-    *,
-    replace: bool,
-) -> None:
-    """Make ``name`` refer to the copied dataset. Raises the errors of `push` if another push came first."""
-    project: RootProject = {"id": owner.id, "name": owner.name}
-    previous = before
-    for _ in range(_LOOKS):
-        lasting = previous is not None and pushed.lasting(target, previous["manifest"])
-        if target.roots.push(name, project, dataset.digest, previous, lasting=lasting):
-            break
-        previous = _predecessor(target, local_store, dataset, owner, name, replace=replace)
-    else:
-        raise TacpipeError(
-            f"{name} is pushed to {target.place} by other commands again and again. Run the same command again later."
-        )
-    _expect_kept(target, name, owner, dataset.digest)
+@dataclass(frozen=True)
+class _NamePush:
+    """The push of a copied dataset under a name of the project ``owner``."""
 
+    target: AnyStore
+    local_store: Store
+    dataset: manifest_of.Found
+    owner: Project
+    name: str
+    replace: bool
 
-def _predecessor(
-    target: AnyStore, local_store: Store, dataset: manifest_of.Found, owner: Project, name: str, *, replace: bool
-) -> Root | None:
-    """Return the root that a push replaces, or None if there is none. Raises `UsageError` as `push` does."""
-    before = target.roots.pushed(name, owner.id)
-    if before is None or replace:
+    def predecessor(self) -> Root | None:
+        """Return the root that the push replaces, or None if there is none. Raises `UsageError` as `push` does."""
+        before = self.target.roots.pushed(self.name, self.owner.id)
+        if before is None or self.replace:
+            return before
+        local = self.local_store.roots.get(self.dataset.directory.absolute())
+        seen_manifests: set[str | None] = {self.dataset.digest}
+        if local is not None:
+            seen_manifests |= {*pushed.manifests(local), local.get("previous"), *local.get("pushed", ())}
+        pushed.refuse_newer(self.target, before, seen_manifests, pushed.label(before, pushed.roots(self.target)))
         return before
-    local = local_store.roots.get(dataset.directory.absolute())
-    seen_manifests: set[str | None] = {dataset.digest}
-    if local is not None:
-        seen_manifests |= {local["manifest"], local.get("previous"), *local.get("pushed", ())}
-        seen_manifests |= {entry["manifest"] for entry in local.get("history", ())}
-    pushed.refuse_newer(target, before, seen_manifests, pushed.label(before, pushed.roots(target)))
-    return before
 
+    def publish(self, before: Root | None) -> Root:
+        """Make the name refer to the dataset, and return its root. Raises the errors of `push` if another push came first.
 
-def _expect_kept(target: AnyStore, name: str, owner: Project, manifest: str) -> None:
-    """Raise `TacpipeError` if a concurrent push of the same name overwrote this one's root.
-
-    The lease prevents that, except on file systems without locks; in a bucket it would take three pushes during one.
-    """
-    root = target.roots.pushed(name, owner.id)
-    if root is None or manifest not in pushed.manifests(root):
-        raise TacpipeError(
-            f"Another push of {name} to {target.place} ended at the same time and replaced this one, because there are no "
-            f"locks. Run the same command again, one push at a time."
-        )
+        Raises `TacpipeError` if a concurrent push of the same name overwrote this one's root. The lease prevents that,
+        except on file systems without locks; in a bucket it would take three pushes during one.
+        """
+        target, name, manifest = self.target, self.name, self.dataset.digest
+        project: RootProject = {"id": self.owner.id, "name": self.owner.name}
+        for _ in range(_LOOKS):
+            lasting = before is not None and pushed.lasting(target, before["manifest"])
+            if target.roots.push(name, project, manifest, before, lasting=lasting):
+                break
+            before = self.predecessor()
+        else:
+            raise TacpipeError(
+                f"{name} is pushed to {target.place} by other commands again and again. Run the same command again later."
+            )
+        root = target.roots.pushed(name, self.owner.id)
+        if root is None or manifest not in pushed.manifests(root):
+            raise TacpipeError(
+                f"Another push of {name} to {target.place} ended at the same time and replaced this one, because there "
+                f"are no locks. Run the same command again, one push at a time."
+            )
+        return root
 
 
 def _find_dataset(path: Path, source: AnyStore) -> tuple[manifest_of.Found, str]:

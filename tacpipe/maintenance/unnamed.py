@@ -15,9 +15,10 @@ from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.datasets.pages import MissingPageError, PageContent, StoredPages
 from tacpipe.errors import DeniedError, StorageError, TacpipeError
-from tacpipe.io import regular
-from tacpipe.io.files import readable_errors
+from tacpipe.io import regular, threads
 from tacpipe.io.hashing import DIGEST, bytes_digest
+from tacpipe.store import layout
+from tacpipe.store.remote import AnyStore
 from tacpipe.store.store import Store
 
 _BEGINS = b"{\n"  # prefix of every manifest, but of no Parquet file
@@ -33,7 +34,7 @@ class _Candidate:
     objects: set[str]
 
 
-def irreplaceable(store: Store, objects: Iterable[str], named_manifests: Iterable[Manifest]) -> dict[str, set[str]]:
+def irreplaceable(store: AnyStore, objects: Iterable[str], named_manifests: Iterable[Manifest]) -> dict[str, set[str]]:
     """Return the manifests and pages among ``objects`` that must be retained, as digest -> all digests in it.
 
     They contain recordings or labels that are neither in ``named_manifests`` nor in another retained manifest or page. A
@@ -94,27 +95,28 @@ def digests(content: bytes) -> set[str]:
     return set(DIGEST.findall(content.decode("latin-1")))
 
 
-def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
+def named_by_pages(store: AnyStore, names: Collection[str]) -> set[str]:
     """Return the digests in the objects with these names that are pages of a manifest."""
     return {digest for _, content in _objects_with_marks(store, names, (pages.BEGINS,)) for digest in digests(content)}
 
 
-def _objects_with_marks(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of the objects with these names that start with a mark.
+def _objects_with_marks(store: AnyStore, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of the objects with these names that start with a mark; the content is not verified.
 
     Objects that this user may not read are noted in the store.
     """
-    for name in names:
-        path = store.object_path(name)
+
+    def read(name: str) -> tuple[str, bytes]:
         try:
-            with readable_errors(path, reading=True):
-                with regular.opened(path, follow=False) as file:
-                    if not file.read(max(map(len, marks))).startswith(marks):
-                        continue
-                content = regular.content(path, regular.JSON_BYTES, follow=False)
+            blocks = store.files.blocks(layout.object_name(name), regular.JSON_BYTES)
+            first = next(blocks, b"")
+            return name, b"".join([first, *blocks]) if first.startswith(marks) else b""
         except (FileNotFoundError, regular.IrregularError):
-            continue
+            return name, b""
         except DeniedError as error:
+            if not isinstance(store, Store):
+                raise
             store.note_denied(name, error)
-            continue
-        yield name, content
+            return name, b""
+
+    return ((name, content) for name, content in threads.map_in_threads(read, names, store.at_once) if content)

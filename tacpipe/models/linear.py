@@ -1,37 +1,41 @@
-"""Fit the linear baselines of every forecaster: a mean, a damped trend and three least-squares maps.
+"""Fit the linear baselines of every forecaster: a mean, an autoregression, and three maps of motion and touch.
 
 Windows are three arrays: ``past`` (window, context, channel), counts above rest, newest last; ``motion`` (window,
 context + horizon, state), the arm's state in the same rows and then its plan; ``ahead`` (window, horizon, channel),
 counts above rest. Every forecast is in counts above rest, with the shape of ``ahead``:
 
 - ``train_mean``: the mean of ``ahead`` over the training windows and steps, of each channel;
-- ``damped_trend``: x_t + (phi + phi^2 + ... + phi^h) (x_t - x_{t-lag}) / lag, h steps ahead (Gardner and McKenzie,
-  Forecasting trends in time series, 1985, equation 2), with the phi and lag, shared by all channels, that minimise the
-  squared error on the training windows. With phi = 0 it is persistence;
-- ``last_value_linear``: NLinear (Zeng, Chen, Zhang and Xu, Are Transformers Effective for Time Series Forecasting?,
-  2023, section 4): the last value is subtracted, one map from context to horizon is shared by all channels, and the
-  last value is added again;
+- ``autoregression``: each channel's change at each step from its own last changes, by ridge regression without
+  intercept, with one regression per step (Marcellino, Stock and Watson, A comparison of direct and iterated multistep AR
+  methods, 2006, equation 3). Rows that repeat the row before are skipped, and each age of the newest new row has its own
+  coefficients, which are shrunk towards the least-squares coefficients shared by all channels;
+- ``plan_by_load``: the change of all channels at each step from the present and the planned motion of this step, times
+  the load, by ridge regression without intercept. The load is the mean of |x_t| over the channels in counts, so without
+  load no motion has an effect;
 - ``ridge``: ridge regression of ``ahead - x_t``, all steps and channels at once, on the changes x_{t-j} - x_t and the
   past motion, with standardised features (Hoerl and Kennard, Ridge Regression, 1970);
 - ``ridge_actions``: the same with the planned motion among the features.
 
-Squared errors are in counts, so the axes that move most determine phi, lag and alpha.
+Squared errors are in counts, so the axes that move most determine the alphas. The changes of ``autoregression`` and
+``plan_by_load`` are multiplied by a weight per step, as those of a model are (`persistence_weights`).
 
-All five are computed from the same sums over windows, accumulated once, in chunks and as float64. The trend and NLinear
-are shared by all channels, so they need only the diagonal blocks of the ridge's matrices; the ridge without actions
-needs the leading block of the matrices with actions.
+All are computed from sums over windows, accumulated in chunks and as float64. The ridge without actions needs the leading
+block of the matrices with actions.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
+import torch
 
-from tacpipe.arrays import AnyFloats
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.models.forecasts import persistence_weights
 
 
 class WindowArray(Protocol):
@@ -55,12 +59,13 @@ class WindowArray(Protocol):
 Windows = tuple[AnyFloats, AnyFloats, AnyFloats]  # past, motion and ahead
 WindowArrays = tuple[WindowArray, WindowArray, WindowArray]
 
-NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions")
+NAMES = ("train_mean", "autoregression", "plan_by_load", "ridge", "ridge_actions")
 ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # for standardised features and sums over windows, as in scikit-learn
-PHIS = tuple(step / 20 for step in range(21))
 CHUNK = 2048  # windows per chunk: 35 MB with 1,100 features and 960 targets
-# fraction of NLinear's mean square that regularises it: repeated frames make its matrix nearly singular
-RIDGE_SHARE = 1e-6
+SAMPLES = 3  # number of changes between new rows that the autoregression reads
+AGES = 8  # number of ages of the newest new row with own coefficients; older ones have those of the last
+SINGULAR = 1e-6  # fraction of the largest singular value below which one counts as zero
+SHRINKING = 3000  # maximum number of evenly spaced validation windows for fitting the weights per step
 
 
 @dataclass(frozen=True)
@@ -89,22 +94,140 @@ class AffineMap:
 
 
 @dataclass(frozen=True)
+class ChangeMap(ABC):
+    """Ridge regressions without intercept of the change since the last row, one regression for each channel or step."""
+
+    NAME: ClassVar[str]
+    AXIS: ClassVar[int]  # axis of the regressions in (window, step, channel)
+
+    weight: AnyFloats  # (regression, feature, target), counts per unit of the feature
+    shrinkage: AnyFloats  # (step,), factor of the change
+    alpha: float
+
+    @staticmethod
+    @abstractmethod
+    def features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
+        """Return the features (regression, window, feature) of windows."""
+
+    @classmethod
+    def fit(cls, training: WindowArrays, validation: WindowArrays, recordings: Int64s) -> Self:
+        """Fit the weights on ``training``, and alpha and shrinkage on ``validation``; see `FittedBaselines.fit`."""
+        xx, xy = cls._sums(training)
+        evaluated_xx, evaluated_xy = cls._sums(validation)
+        power = np.einsum("...ff->...f", xx) / len(training[0])  # (regression, feature)
+        penalty = np.where(power > 0, power, 1)[..., None] * np.eye(power.shape[-1])
+        prior = cls._prior(xx, xy)
+        weights = [prior + np.linalg.solve(xx + alpha * penalty, xy - xx @ prior) for alpha in ALPHAS]
+        # The term of the error that does not depend on alpha is left out.
+        errors = [(weight * (evaluated_xx @ weight - 2 * evaluated_xy)).sum() for weight in weights]
+        best = int(np.argmin(errors))
+        fitted = cls(weights[best].astype(np.float32), np.ones(training[2].shape[1], np.float32), ALPHAS[best])
+        windows = slice(None, None, max(1, -(-len(recordings) // SHRINKING)))
+        past, motion, ahead = (array[windows].astype(np.float32) for array in validation)
+        changes, measured = (
+            torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1)))
+            for values in (fitted.changes(past, motion), ahead - past[:, -1:])
+        )
+        shrinkage = persistence_weights(changes, measured, torch.from_numpy(recordings[windows]))
+        return replace(fitted, shrinkage=shrinkage.numpy())
+
+    @classmethod
+    def _prior(cls, xx: AnyFloats, xy: AnyFloats) -> AnyFloats:
+        """Return the weights towards which a larger alpha shrinks, from the sums of `_sums`."""
+        return np.zeros_like(xy)
+
+    @classmethod
+    def _sums(cls, part: WindowArrays) -> tuple[AnyFloats, AnyFloats]:
+        """Return the sums over windows of feature-feature and feature-target products, each with the axis of weights."""
+        sums: list[AnyFloats] = []
+        for first in range(0, len(part[0]), CHUNK):
+            past, motion, ahead = (array[first : first + CHUNK].astype(np.float64) for array in part)
+            features = cls.features(past, motion)
+            targets = np.moveaxis(ahead - past[:, -1:], cls.AXIS, 0)  # (regression, window, target)
+            products: list[AnyFloats] = [features.swapaxes(1, 2) @ other for other in (features, targets)]
+            sums = [total + product for total, product in zip(sums, products, strict=True)] if sums else products
+        return sums[0], sums[1]
+
+    def changes(self, past: AnyFloats, motion: AnyFloats) -> AnyFloats:
+        """Return the changes (window, step, channel) since the last row, in counts."""
+        return np.moveaxis(self.features(past, motion) @ self.weight, 0, self.AXIS) * self.shrinkage[:, None]
+
+    def to_tensors(self) -> dict[str, AnyFloats]:
+        """Return the arrays that `from_tensors` reads."""
+        parts = {"weight": self.weight, "shrinkage": self.shrinkage, "alpha": np.array([self.alpha])}
+        return {f"{self.NAME}.{part}": values for part, values in parts.items()}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, AnyFloats]) -> Self:
+        """Return the map that `to_tensors` stored."""
+        weight, shrinkage, alpha = (tensors[f"{cls.NAME}.{part}"] for part in ("weight", "shrinkage", "alpha"))
+        return cls(weight, shrinkage, float(alpha[0]))
+
+
+class Autoregression(ChangeMap):
+    """The change of each channel from its last changes between new rows."""
+
+    NAME, AXIS = "autoregression", 2
+
+    @staticmethod
+    def features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
+        """Return the last changes between new rows, newest first, in the place of the age: (channel, window, feature).
+
+        A row is new if any channel differs from the row before, as in `tacpipe.models.windows.repeats`. The age is the
+        number of rows since the newest new row. Changes from before the window are 0.
+        """
+        windows, context, channels = past.shape
+        new = np.ones((windows, context), bool)
+        new[:, 1:] = (past[:, 1:] != past[:, :-1]).any(axis=2)
+        rows = np.sort(np.where(new, np.arange(context), 0), axis=1)[:, ::-1]  # new rows, newest first, then zeros
+        rows = rows[:, np.minimum(np.arange(SAMPLES + 1), context - 1)]
+        samples = np.take_along_axis(past, rows[:, :, None], axis=1)
+        ages = min(context, AGES)
+        features = np.zeros((channels, windows, ages, SAMPLES), past.dtype)
+        age = np.minimum(context - 1 - rows[:, 0], ages - 1)
+        features[:, np.arange(windows), age] = (samples[:, :-1] - samples[:, 1:]).transpose(2, 0, 1)
+        return features.reshape(channels, windows, -1)
+
+    @classmethod
+    def _prior(cls, xx: AnyFloats, xy: AnyFloats) -> AnyFloats:
+        """Return the least-squares weights shared by all channels."""
+        shared = np.linalg.lstsq(xx.sum(axis=0), xy.sum(axis=0), rcond=SINGULAR)[0]
+        return np.broadcast_to(shared, xy.shape)
+
+
+class PlanByLoad(ChangeMap):
+    """The change of all channels from the motion times the load, with one regression per step."""
+
+    NAME, AXIS = "plan_by_load", 1
+
+    @staticmethod
+    def features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
+        """Return the present and the planned motion of each step, times the load: (step, window, feature)."""
+        now, plan = motion[:, past.shape[1] - 1, None], motion[:, past.shape[1] :]
+        load = np.abs(past[:, -1]).mean(axis=1)
+        moved = np.concatenate([np.broadcast_to(now, plan.shape), plan], axis=2)
+        return np.ascontiguousarray((moved * load[:, None, None]).swapaxes(0, 1))
+
+
+CHANGE_MAPS: tuple[type[ChangeMap], ...] = (Autoregression, PlanByLoad)
+
+
+@dataclass(frozen=True)
 class FittedBaselines:
     """The fitted baselines, in float32 like the forecasts."""
 
     mean_count: AnyFloats  # (channel,)
-    phi: float
-    lag: int  # number of rows of the trend; 0 if the context is a single frame
-    shared_weight: AnyFloats  # (context - 1, horizon)
-    shared_bias: AnyFloats  # (horizon,), counts
+    change_maps: tuple[ChangeMap, ...]  # `CHANGE_MAPS`; models from before version 8 of `train forward` have none
     ridge: AffineMap
     ridge_actions: AffineMap
 
     @classmethod
-    def fit(cls, training: WindowArrays, validation: WindowArrays) -> FittedBaselines:
-        """Fit the baselines on ``training``, a tuple (past, motion, ahead); the alphas are chosen on ``validation``.
+    def fit(cls, training: WindowArrays, validation: WindowArrays, recordings: Int64s) -> FittedBaselines:
+        """Fit the baselines on ``training``, a tuple (past, motion, ahead).
 
-        Raises `TacpipeError` if a part has no windows, shapes do not match or a value is not finite.
+        Alphas and weights per step are chosen on ``validation``, whose windows are of the recordings with the numbers
+        ``recordings`` (window,). Raises `TacpipeError` if a part has no windows, shapes do not match or a value is not
+        finite.
         """
         _validate_windows("training", training)
         _validate_windows("validation", validation)
@@ -113,32 +236,24 @@ class FittedBaselines:
                 f"Validation windows of {_shapes(validation)} do not fit training windows of {_shapes(training)}; all "
                 "but their number must be equal."
             )
-        past, motion, ahead = training
-        (context, channels), horizon = past.shape[1:], ahead.shape[1]
+        motion, horizon = training[1], training[2].shape[1]
         means = [_mean(arrays) for arrays in training]
         centre = _features(means[0][None], means[1][None])[0]
         bias = (means[2] - means[0][-1]).ravel()
         sums, evaluated = (_FeatureSums.accumulate(part, centre, bias) for part in (training, validation))
         without_plan = centre.size - horizon * motion.shape[2]  # number of features without the plan
-        shared = _SharedSums.from_sums(sums, centre, bias, (context - 1, channels, horizon))
-        phi, lag = shared.damped_trend()
-        shared_weight, shared_bias = shared.least_squares()
         return cls(
             means[2].mean(axis=0).astype(np.float32),
-            phi,
-            lag,
-            shared_weight.astype(np.float32),
-            shared_bias.astype(np.float32),
+            tuple(kind.fit(training, validation, recordings) for kind in CHANGE_MAPS),
             _ridge(sums.first(without_plan), evaluated.first(without_plan), centre[:without_plan], bias),
             _ridge(sums, evaluated, centre, bias),
         )
 
     @property
     def settings(self) -> dict[str, float]:
-        """The settings with the least squared error: phi, the lag in rows, and the two alphas."""
+        """The alphas with the least squared error on the validation windows."""
         return {
-            "damped_trend.phi": self.phi,
-            "damped_trend.lag": float(self.lag),
+            **{f"{fitted.NAME}.alpha": fitted.alpha for fitted in self.change_maps},
             "ridge.alpha": self.ridge.alpha,
             "ridge_actions.alpha": self.ridge_actions.alpha,
         }
@@ -153,38 +268,31 @@ class FittedBaselines:
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
         if their shapes are not those of the training windows.
         """
-        past_changes, horizon = self.shared_weight.shape
-        channels = len(self.mean_count)
-        steps = past_changes + 1 + horizon
-        states = (len(self.ridge_actions.centre) - past_changes * channels) // steps
-        if past.shape[1:] != (past_changes + 1, channels) or motion.shape != (len(past), steps, states):
+        channels, before = len(self.mean_count), len(self.ridge.centre)  # channels, and features without the plan
+        horizon = len(self.ridge.bias) // channels
+        states = (len(self.ridge_actions.centre) - before) // horizon
+        context = (before + channels) // (channels + states)
+        steps = context + horizon
+        if past.shape[1:] != (context, channels) or motion.shape != (len(past), steps, states):
             raise TacpipeError(
                 f"Past frames of {past.shape} and motion of {motion.shape} do not fit the baselines; (window, "
-                f"{past_changes + 1}, {channels}) and (window, {steps}, {states}) were fitted."
+                f"{context}, {channels}) and (window, {steps}, {states}) were fitted."
             )
-        frames = past.astype(np.float32, copy=False)
+        frames, motion = past.astype(np.float32, copy=False), motion.astype(np.float32, copy=False)
         last = frames[:, -1:]  # (window, 1, channel)
         shape = len(frames), horizon, channels
         yield "train_mean", np.broadcast_to(self.mean_count, shape).copy()
-        slope = (last - frames[:, -1 - self.lag, None]) / np.float32(max(self.lag, 1))
-        damping = _damping(np.array([self.phi]), horizon)[0].astype(np.float32)  # (step,)
-        yield "damped_trend", last + damping[:, None] * slope
-        shared = np.matmul(self.shared_weight.T, frames[:, :-1] - last) + self.shared_bias[:, None]
-        yield "last_value_linear", last + shared
-        del shared
-        features = _features(frames, motion.astype(np.float32, copy=False))
+        for fitted in self.change_maps:
+            yield fitted.NAME, last + fitted.changes(frames, motion)
+        features = _features(frames, motion)
         for name, ridge in (("ridge", self.ridge), ("ridge_actions", self.ridge_actions)):
             yield name, last + ridge(features[:, : len(ridge.centre)]).reshape(shape)
 
     def to_tensors(self) -> dict[str, AnyFloats]:
         """Return the arrays that `from_tensors` reads."""
-        tensors: dict[str, AnyFloats] = {
-            "train_mean": self.mean_count,
-            "damped_trend.phi": np.array([self.phi]),
-            "damped_trend.lag": np.array([float(self.lag)]),
-            "last_value_linear.weight": self.shared_weight,
-            "last_value_linear.bias": self.shared_bias,
-        }
+        tensors: dict[str, AnyFloats] = {"train_mean": self.mean_count}
+        for fitted in self.change_maps:
+            tensors |= fitted.to_tensors()
         return tensors | self.ridge.to_tensors("ridge") | self.ridge_actions.to_tensors("ridge_actions")
 
     @classmethod
@@ -192,10 +300,7 @@ class FittedBaselines:
         """Return the baselines that `to_tensors` stored."""
         return cls(
             tensors["train_mean"],
-            float(tensors["damped_trend.phi"][0]),
-            int(tensors["damped_trend.lag"][0]),
-            tensors["last_value_linear.weight"],
-            tensors["last_value_linear.bias"],
+            tuple(kind.from_tensors(tensors) for kind in CHANGE_MAPS if f"{kind.NAME}.weight" in tensors),
             AffineMap.from_tensors("ridge", tensors),
             AffineMap.from_tensors("ridge_actions", tensors),
         )
@@ -233,58 +338,6 @@ class _FeatureSums:
         return _FeatureSums(self.windows, self.xx[:features, :features], self.xy[:features])
 
 
-@dataclass(frozen=True)
-class _SharedSums:
-    """The same sums for features that all channels share: over windows and channels, nothing taken off."""
-
-    count: int  # number of windows times number of channels
-    x: AnyFloats  # (context - 1,)
-    y: AnyFloats  # (horizon,)
-    xx: AnyFloats  # (context - 1, context - 1)
-    xy: AnyFloats  # (context - 1, horizon)
-
-    @classmethod
-    def from_sums(
-        cls, sums: _FeatureSums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]
-    ) -> _SharedSums:
-        """Return the sums over all windows and channels, from the blocks of each channel with itself.
-
-        ``shape`` is context - 1, channels and horizon.
-        """
-        before, channels, horizon = shape
-        changes = before * channels  # the changes are the first features
-        x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
-        xx = sums.xx[:changes, :changes].reshape(before, channels, before, channels)
-        xy = sums.xy[:changes].reshape(before, channels, horizon, channels)
-        return cls(
-            sums.windows * channels,
-            sums.windows * x.sum(axis=1),
-            sums.windows * y.sum(axis=1),
-            np.einsum("icjc->ij", xx) + sums.windows * x @ x.T,
-            np.einsum("ichc->ih", xy) + sums.windows * x @ y.T,
-        )
-
-    def damped_trend(self) -> tuple[float, int]:
-        """Return phi and the lag in rows of the trend with the least squared error; zeros for a context of one frame."""
-        if not len(self.x):
-            return 0.0, 0
-        lags = np.arange(1, len(self.x) + 1)  # changes are ordered oldest first, and each is -lag times the slope
-        damping = _damping(np.array(PHIS), len(self.y))  # (phi, step)
-        slope_y = -self.xy[::-1] / lags[:, None]  # (lag, step)
-        slope_slope = np.diagonal(self.xx)[::-1] / lags**2  # (lag,)
-        error = np.square(damping).sum(axis=1)[:, None] * slope_slope - 2 * damping @ slope_y.T  # (phi, lag)
-        phi, lag = np.unravel_index(error.argmin(), error.shape)
-        return PHIS[phi], int(lags[lag])
-
-    def least_squares(self) -> tuple[AnyFloats, AnyFloats]:
-        """Return the least-squares weight (context - 1, horizon) and bias (horizon,)."""
-        x, y = self.x / self.count, self.y / self.count
-        xx, xy = self.xx - self.count * np.outer(x, x), self.xy - self.count * np.outer(x, y)
-        power = np.trace(xx) / max(len(x), 1)
-        weight = np.linalg.solve(xx + (RIDGE_SHARE * power if power > 0 else 1.0) * np.eye(len(x)), xy)
-        return weight, y - x @ weight
-
-
 def _ridge(sums: _FeatureSums, evaluated: _FeatureSums, centre: AnyFloats, bias: AnyFloats) -> AffineMap:
     """Return the ridge regression with the alpha that minimises the squared error on the windows of ``evaluated``.
 
@@ -311,11 +364,6 @@ def _features(past: AnyFloats, motion: AnyFloats) -> AnyFloats:
     """Return changes from the last frame, oldest first, then the motion with its plan: (window, feature)."""
     windows = len(past)
     return np.concatenate([(past[:, :-1] - past[:, -1:]).reshape(windows, -1), motion.reshape(windows, -1)], axis=1)
-
-
-def _damping(phi: AnyFloats, horizon: int) -> AnyFloats:
-    """Return phi + phi^2 + ... + phi^h for h from 1 to ``horizon``, shape (phi, step)."""
-    return np.cumsum(phi[:, None] ** np.arange(1, horizon + 1), axis=1)
 
 
 def _mean(arrays: WindowArray) -> AnyFloats:

@@ -85,12 +85,13 @@ def metadata(annotation: Any) -> tuple[Any, ...]:
     return get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
 
 
-def check(value: Any, annotation: Any, name: str, place: str = "") -> Any:
+def check(value: Any, annotation: Any, name: str, place: str = "", noun: str = "key") -> Any:
     """Return ``value`` converted to the type of ``annotation``: an int becomes a float if a float is expected.
 
-    ``name`` and ``place`` identify the value in messages. Raises `UsageError` if it is invalid.
+    ``name`` and ``place`` identify the value in messages, and ``noun`` is the word for keys of a table in it. Raises
+    `UsageError` if it is invalid.
     """
-    fitted = _fit(value, annotation, f"{place}, {name}" if place else name)
+    fitted = _fit(value, annotation, f"{place}, {name}" if place else name, noun)
     if fitted is REFUSED:
         subject = f"{place}: {name}" if place else name
         raise UsageError(f"{subject} is {format_value(value)}; it must be {describe(annotation)}.")
@@ -109,11 +110,13 @@ def format_value(value: Any) -> str:
 
 def fits(value: Any, annotation: Any) -> bool:
     """Return whether ``value`` is valid for ``annotation``."""
-    return _fit(value, annotation, "") is not REFUSED
+    return _fit(value, annotation, "", "key") is not REFUSED
 
 
-def build_dataclass(kind: type[Any], values: Values, place: str, noun: str = "param") -> Any:
+def build_dataclass(kind: type[Any], values: Values, place: str, noun: str = "param", inner_noun: str = "key") -> Any:
     """Return the dataclass ``kind`` with ``values`` in place of defaults; an int becomes a float if a float is expected.
+
+    ``noun`` is the word for its names in messages, and ``inner_noun`` that for names in tables within it.
 
     Raises `UsageError` for unknown names, invalid values, and missing values without a default.
     """
@@ -122,7 +125,7 @@ def build_dataclass(kind: type[Any], values: Values, place: str, noun: str = "pa
     for key, value in values.items():
         if key not in annotations:
             raise unknown(key, annotations, place, noun)
-        fitting[key] = check(value, annotations[key], key, place)
+        fitting[key] = check(value, annotations[key], key, place, inner_noun)
     missing = [
         field.name
         for field in dataclasses.fields(kind)
@@ -182,21 +185,21 @@ def describe(annotation: Any) -> str:
     return names.get(annotation, str(annotation))
 
 
-def _fit(value: Any, annotation: Any, place: str) -> Any:
+def _fit(value: Any, annotation: Any, place: str, noun: str) -> Any:
     """Return ``value`` converted to the type of ``annotation``, or `REFUSED` if it is invalid.
 
     A mapping fills a dataclass, with the errors of `build_dataclass`.
     """
     origin = get_origin(annotation)
     if origin is Annotated:
-        fit = _fit(value, get_args(annotation)[0], place)
+        fit = _fit(value, get_args(annotation)[0], place, noun)
         return (
             fit
             if fit is not REFUSED and all(constraint.allows(fit) for constraint in constraints(annotation))
             else REFUSED
         )
     if origin in _UNIONS:
-        fits = (_fit(value, kind, place) for kind in get_args(annotation))
+        fits = (_fit(value, kind, place, noun) for kind in get_args(annotation))
         return next((fit for fit in fits if fit is not REFUSED), REFUSED)
     if origin is Literal:  # 1, 1.0 and True are equal, but give three different keys
         return next(
@@ -205,11 +208,12 @@ def _fit(value: Any, annotation: Any, place: str) -> Any:
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return REFUSED
-        fitted = [_fit(item, get_args(annotation)[0], f"{place} {row}") for row, item in enumerate(value, start=1)]
+        kind = get_args(annotation)[0]
+        fitted = [_fit(item, kind, f"{place} {row}", noun) for row, item in enumerate(value, start=1)]
         return REFUSED if any(fit is REFUSED for fit in fitted) else tuple(fitted)
     if dataclasses.is_dataclass(annotation):
         if isinstance(value, Mapping):
-            return build_dataclass(typing.cast(type, annotation), value, place, "key")
+            return build_dataclass(typing.cast(type, annotation), value, place, noun)
         return value if isinstance(value, typing.cast(type, annotation)) else REFUSED
     return _fit_plain(value, annotation)
 

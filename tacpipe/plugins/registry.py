@@ -26,7 +26,7 @@ from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
 if TYPE_CHECKING:
-    from tacpipe.tasks.task import Task
+    from tacpipe.plugins.requirements import Requirements
 
 STAGES, FORMATS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.sensors"
 TASKS = "tacpipe.tasks"  # name: a subclass of `tacpipe.tasks.task.Task`
@@ -293,13 +293,15 @@ def load(name: str) -> AnyStage:
 def load_step(name: str) -> AnyStage:
     """Return the stage with this name, or a stage's fit or part: ``compress.pca.fit`` is the fit of ``compress.pca``."""
     stage = load(stage_name(name))
-    if name.endswith(FIT):
-        assert stage.fit is not None
-        return stage.fit
-    if name.endswith(PART):
-        assert stage.part is not None
-        return stage.part
-    return stage
+    nested = stage.fit if name.endswith(FIT) else stage.part if name.endswith(PART) else stage
+    assert nested is not None
+    return nested
+
+
+def requirements(name: str) -> Requirements | None:
+    """Return what recordings must contain for a stage ``train.TASK``, or None for other stages."""
+    task = name.removeprefix(PREFIXES[TASKS])
+    return load_task(task).requirements if task != name and task in tasks() else None
 
 
 def tasks() -> list[str]:
@@ -307,21 +309,20 @@ def tasks() -> list[str]:
     return sorted(entry_points()[TASKS])
 
 
-def load_task(name: str) -> Task:
-    """Return the task with this name.
+def load_task(name: str) -> Any:
+    """Return the task with this name, a `tacpipe.tasks.task.Task`.
 
-    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is not a subclass of `Task`.
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is not a subclass of that.
     """
     task_class = _load_plugin(TASKS, "task", name)
     try:
-        task: Task = task_class()
+        return task_class()
     except TypeError as error:  # a module, an instance, or a class that lacks abstract members
         target = entry_points()[TASKS][str(name)]
         raise TacpipeError(
             f"{target}, registered as task {plain(str(name))}, is not a task ({error}): it must be a subclass of "
             f"tacpipe.tasks.task.Task."
         ) from error
-    return task
 
 
 def sensors() -> dict[str, str]:

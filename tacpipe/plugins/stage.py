@@ -6,16 +6,15 @@ of each further parameter determines what the stage reads:
 =================  ==================================================================================================
 ``Recording``      one recording; the stage is run, keyed and stored for each recording separately
 ``Dataset``        all recordings; an argument named ``train``, ``val`` or ``test`` contains only that role, and may be
-                   empty if it is annotated ``Dataset | None``; ``originals`` are the recordings as they were given,
-                   before the stages in ``first``
+                   empty if it is annotated ``Dataset | None``
 ``Datasets``       several datasets, as a tuple
 ``Rows``           the rows that were read for each of the ``Datasets`` and those that it comes from, by stage
 ``Model``          a trained model: a `Dataset` whose ``files`` contain weights and configuration; ``init`` is optional
-``Fitted``         the files that the stage's ``fit`` computed from the training recordings
-``Parts``          the results of the stage's ``part`` for each recording, as a `Dataset`
+``Fitted``         the files that a nested stage computed from the training recordings: ``Annotated[Fitted, fit]``
+``Parts``          the results of a nested stage for each recording, as a `Dataset`: ``Annotated[Parts, part]``
 ``RecordingName``  the name of the recording; it becomes part of the key, so only stages that need it have it
-``Files``          the files of one recording of a source, found by the stage's ``discover``
-``Values``         further values from ``discover`` for one recording, such as labels; part of its key
+``Files``          the files of one recording of a source, found by the stage's ``source``
+``Values``         further values from ``source`` for one recording, such as labels; part of its key
 ``Shared``         files shared by the recordings of a run, each created once; ``Shared | None``, as there may be no run
 ``Trial``          the index of one recording to simulate, from 0 to ``params.trials``
 ``Roles``          role by (recording, fold), empty without the option: ``extend`` contains those of the older split given
@@ -23,19 +22,21 @@ of each further parameter determines what the stage reads:
 ``Workspace``      a folder for checkpoints that survives an interruption
 =================  ==================================================================================================
 
-Annotations are read as text, so a stage module imports nothing for them outside ``TYPE_CHECKING``.
+What a stage needs beyond its inputs is a nested call in the annotation of the argument. A nested stage has the params of
+the stage, and its own version and stored results, whose files become files of the result. In ``Annotated[Dataset,
+prepare]``, ``prepare`` is a function from the params to the stages that the recordings go through first.
 
-`Requirements` describe what recordings must contain for a task, by quantity and unit.
+Annotations are read as text, so a stage module imports nothing for them outside ``TYPE_CHECKING``.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar, cast
 
 from tacpipe.errors import TacpipeError
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from tacpipe.io.files import Draft
 
 ROLES = ("train", "val", "calibration", "test")
-ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # path by name in the source
 Values = Json  # values of a recording from ``discover``, and other JSON values by name
@@ -113,9 +113,25 @@ class Source:
 
 
 Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
-# (params, source) -> (path in the source -> reason why it is not read, "" for files used otherwise, such as labels)
-WhyUnread = Callable[[Any, Path], Callable[[str], str]]
-First = Callable[[Any], Mapping[str, Values]]  # params -> params of preceding stages by name
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How a stage finds recordings in a folder; the functions get the params and the folder, or only the folder.
+
+    ``why_unread`` returns a function from a path in the folder to the reason why the file is not read, or "" for a file
+    that is used otherwise, such as labels. ``preview`` describes what would be read (``--dry-run``), and ``guess`` returns
+    a first layout file (``--guess``).
+    """
+
+    discover: Discover
+    why_unread: Callable[[Any, Path], Callable[[str], str]] | None = None
+    preview: Callable[[Any, Path], str] | None = None
+    guess: Callable[[Path], str] | None = None
+
+
+# params -> params of the stages that recordings go through first, by name; None for the stages of the model's chain
+Prepare = Callable[[Any], Mapping[str, Values] | None]
 
 
 @dataclass(frozen=True)
@@ -141,19 +157,9 @@ class Stage(Generic[P, R]):
     version: int
     # attributes that the function reads; None for no attribute of a Recording and all of a Dataset
     reads: tuple[str, ...] | None = None
-    fit: AnyStage | None = None  # computes the files of a ``Fitted`` argument
-    # runs on each recording; its files become files of the result, its tables are ``Parts``
-    part: AnyStage | None = None
-    first: First | None = None  # preceding stages, depending on the params
-    originals: Callable[[Any], str] | None = None  # folder of the result for input shards; empty for none
-    discover: Discover | None = None
+    source: Discovery | None = None  # how ``Files`` are found; the result cannot be recomputed from the store
     headline: str | None = None  # file of the result with its headlines, which the command prints
-    preview: Callable[[Any, Path], str] | None = None  # describes what would be read from a source (--dry-run)
-    guess: Callable[[Path], str] | None = None  # returns a first layout file for a source (--guess)
-    why_unread: WhyUnread | None = None
-    requirements: Requirements | None = None  # requirements on recordings for training a task (--requirements)
-    # returns whether recordings are read unchanged, without the stages of the model's chain
-    as_given: Callable[[Any], bool] | None = None
+    originals: Callable[[Any], str] | None = None  # folder of the result for input shards; empty for none
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function with the streams that its params select, without a store."""
@@ -164,17 +170,29 @@ class Stage(Generic[P, R]):
         if name := self.argument("Recording"):
             bound.arguments[name] = params.narrow(bound.arguments[name])
         output = self.function(*bound.args, **bound.kwargs)
-        return cast("R", params.narrow_output(output)) if self.source else output
+        return cast("R", params.narrow_output(output)) if self.source is not None else output
+
+    @functools.cached_property
+    def _annotations(self) -> dict[str, tuple[str, Any]]:
+        """The annotated type as text and the nested call (or None) of each argument after ``params``, by name."""
+        names = inspect.unwrap(self.function).__globals__
+        parameters = list(inspect.signature(self.function).parameters.items())[1:]
+        return {name: _split_annotation(parameter.annotation, names) for name, parameter in parameters}
 
     @functools.cached_property
     def arguments(self) -> dict[str, str]:
         """The kind of each argument after ``params``, by name. Raises `TacpipeError` for an unknown annotation."""
         kinds = {}
-        for name, parameter in list(inspect.signature(self.function).parameters.items())[1:]:
-            kind = _text(parameter.annotation).removesuffix(" | None").rpartition(".")[2]
+        for name, (text, nested) in self._annotations.items():
+            kind = text.removesuffix(" | None").rpartition(".")[2]
             if kind not in _KINDS:
                 raise TacpipeError(
                     f"Stage {self.function.__name__} annotates {name} as {kind}; known are {', '.join(_KINDS)}."
+                )
+            if kind in ("Fitted", "Parts") and nested is None:
+                raise TacpipeError(
+                    f"Stage {self.function.__name__} annotates {name} as {kind}; it must be Annotated[{kind}, STAGE], with "
+                    f"the stage that computes it."
                 )
             kinds[name] = kind
         return kinds
@@ -185,7 +203,25 @@ class Stage(Generic[P, R]):
 
     def optional(self, name: str) -> bool:
         """Return whether the argument ``name`` is optional."""
-        return _text(inspect.signature(self.function).parameters[name].annotation).endswith(" | None")
+        return self._annotations[name][0].endswith(" | None")
+
+    @property
+    def fit(self) -> AnyStage | None:
+        """The nested stage that computes the files of the argument ``Fitted``."""
+        return self._nested("Fitted")
+
+    @property
+    def part(self) -> AnyStage | None:
+        """The nested stage that runs on each recording and computes the argument ``Parts``."""
+        return self._nested("Parts")
+
+    def _nested(self, kind: str) -> AnyStage | None:
+        name = self.argument(kind)
+        return None if name is None else cast("AnyStage", self._annotations[name][1])
+
+    def prepare(self, name: str) -> Prepare | None:
+        """Return the function from params to the stages that the recordings of argument ``name`` go through first."""
+        return cast("Prepare | None", self._annotations[name][1]) if self.arguments[name] == "Dataset" else None
 
     @functools.cached_property
     def params(self) -> Any:
@@ -203,11 +239,6 @@ class Stage(Generic[P, R]):
     def mapped(self) -> bool:
         """Whether the stage works recording by recording."""
         return any(kind in ("Recording", "Files", "Trial") for kind in self.arguments.values())
-
-    @property
-    def source(self) -> bool:
-        """Whether the stage's result cannot be recomputed from the store."""
-        return "Files" in self.arguments.values()
 
     @property
     def needs_split(self) -> bool:
@@ -233,127 +264,39 @@ class Stage(Generic[P, R]):
 AnyStage: TypeAlias = Stage[..., Any]
 
 
-def _text(annotation: Any) -> str:
-    """Return an annotation as source text, whether or not Python has evaluated it.
+_ANNOTATED = re.compile(r"(?:[\w.]+\.)?Annotated\[(?P<type>.+), *(?P<nested>\w+)\]")
 
-    >>> _text("tacpipe.Dataset | None"), _text(Path)
-    ('tacpipe.Dataset | None', 'Path')
+
+def _split_annotation(annotation: Any, names: Mapping[str, Any]) -> tuple[str, Any]:
+    """Return the type of an annotation as text, and the nested call of an ``Annotated`` type, or None.
+
+    ``names`` are the global names of the stage's module. Raises `TacpipeError` for a nested call that is not among them.
+
+    >>> _split_annotation("Annotated[Parts, part]", {"part": len}), _split_annotation(Path, {})
+    (('Parts', <built-in function len>), ('Path', None))
     """
-    return annotation.__name__ if isinstance(annotation, type) else str(annotation).strip("'\"")
+    if metadata := getattr(annotation, "__metadata__", ()):
+        return _split_annotation(annotation.__origin__, names)[0], metadata[0]
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation).strip("'\"")
+    match = _ANNOTATED.fullmatch(text)
+    if match is None:
+        return text, None
+    if match["nested"] not in names:
+        raise TacpipeError(f"{text} names {match['nested']}, which its module does not define.")
+    return match["type"], names[match["nested"]]
 
 
 def stage(
     *,
     version: int,
     reads: tuple[str, ...] | None = None,
-    fit: AnyStage | None = None,
-    part: AnyStage | None = None,
-    first: First | None = None,
-    originals: Callable[[Any], str] | None = None,
-    discover: Discover | None = None,
+    source: Discovery | None = None,
     headline: str | None = None,
-    preview: Callable[[Any, Path], str] | None = None,
-    guess: Callable[[Path], str] | None = None,
-    why_unread: WhyUnread | None = None,
-    requirements: Requirements | None = None,
-    as_given: Callable[[Any], bool] | None = None,
+    originals: Callable[[Any], str] | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
     """Return a decorator that makes a function a stage with the same signature.
 
-    Increase ``version`` whenever the stage's result changes. ``headline`` is the file of the result
-    (`tacpipe.metrics.headline`) that the command prints as a table. ``part`` is a stage that runs and is cached by
-    recording, with the same params; its files become files of the result, and an argument ``Parts`` contains its tables.
-    ``first`` returns the preceding stages with their params. ``preview`` describes what ``discover`` and the stage would
-    read from a source; ``guess`` returns a first layout for it; ``why_unread`` explains why files of it are not read.
-    ``requirements`` describe what recordings must contain. ``as_given`` returns, depending on the params, whether
-    recordings skip the stages of a ``Model``.
+    Increase ``version`` whenever the stage's result changes. ``source`` finds the recordings of a stage that reads
+    ``Files``. ``headline`` is the file of the result (`tacpipe.scores.headline`) that the command prints as a table.
     """
-    return lambda function: Stage(
-        function,
-        version,
-        reads,
-        fit,
-        part,
-        first,
-        originals,
-        discover,
-        headline,
-        preview,
-        guess,
-        why_unread,
-        requirements,
-        as_given,
-    )
-
-
-REQUIREMENT_WIDTH = 110  # maximum number of characters per line
-
-
-@dataclass(frozen=True)
-class Channels:
-    """Columns of a quantity that a task reads."""
-
-    quantity: str
-    units: tuple[str, ...]  # accepted units; empty for any single unit
-    description: str  # number of columns, and their components or streams
-    without: str = ""  # sentence on the consequence if they are missing; empty if they are required
-    stream: str = ""  # stream with the columns, if the task looks for it by name
-
-
-@dataclass(frozen=True)
-class Label:
-    """A label of recordings that a task reads."""
-
-    name: str
-    description: str
-    without: str = ""
-
-
-@dataclass(frozen=True)
-class Requirements:
-    """A task's requirements on recordings, and the stages that prepare them."""
-
-    task: str
-    stages: Sequence[str]  # stages whose output the task reads, in order
-    optional_stages: Sequence[str]
-    roles: str  # roles that the split must contain
-    channels: Sequence[Channels]
-    labels: Sequence[Label] = ()
-
-    @property
-    def needed(self) -> tuple[str, ...]:
-        """The required quantities."""
-        return tuple(channel.quantity for channel in self.channels if not channel.without)
-
-    def to_text(self) -> str:
-        """Return the requirements as lines of text."""
-        chain = ", then ".join(f"tacpipe {stage}" for stage in self.stages) or "any stage, or recordings as they are"
-        lines = [f"tacpipe train {self.task} reads the output of", f"  {chain}"]
-        lines += [f"  (optional: {stage})" for stage in self.optional_stages]
-        lines += ["", "roles in the split", *_wrap(self.roles, "  "), ""]
-        lines += ["channels, selected by the quantity and unit of a column, in any stream unless a stream is named"]
-        for channel in self.channels:
-            place = f", stream {channel.stream}" if channel.stream else ""
-            head = f"  {channel.quantity} [{' or '.join(channel.units) or 'any unit'}]{place}: "
-            lines += _wrap(f"{channel.description}. {_format_need(channel.without)}", head)
-        if self.labels:
-            lines += ["", "labels of recordings"]
-            lines += [
-                line
-                for label in self.labels
-                for line in _wrap(f"{label.description}. {_format_need(label.without)}", f"  {label.name}: ")
-            ]
-        lines += [
-            "",
-            "Set quantity, unit, component and {taxel} in the [streams.NAME] columns of a layout file, and labels in its",
-            "[[labels]] or [attributes]. tacpipe label DATASET --from TABLE sets labels later.",
-        ]
-        return "\n".join(lines)
-
-
-def _format_need(without: str) -> str:
-    return f"Optional. {without}" if without else "Required."
-
-
-def _wrap(text: str, head: str) -> list[str]:
-    return wrap(text, REQUIREMENT_WIDTH, initial_indent=head, subsequent_indent="      " if head.strip() else head)
+    return lambda function: Stage(function, version, reads, source, headline, originals)

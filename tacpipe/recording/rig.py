@@ -55,7 +55,6 @@ class Rig:
     streams: Mapping[str, RigStream]
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
-    emulate: Options = field(default_factory=dict)
     live: Values = field(default_factory=dict)  # options of `tacpipe live`, as written
     text: str = ""  # the text of the file, which is stored with every recording
 
@@ -83,7 +82,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
         contents = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers with thousands of digits, deeply nested brackets
         raise UsageError(f"{source} is not valid TOML: {plain(str(error), 200)}.") from error
-    _refuse_unknown(contents, ("master", "labels", "stream", "emulate", "live"), source)
+    _refuse_unknown(contents, ("master", "labels", "stream", "live"), source)
     tables = contents.get("stream")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise UsageError(f"{source} lists no stream; each is a table [[stream]] with name, sensor and transport.")
@@ -103,7 +102,7 @@ def parse(text: str, source: str = "rig.toml") -> Rig:
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
             described = f"label {plain(name)} is {excerpt(value)}"
             raise UsageError(f"{source}: {described}; it must be text, a finite number, true or false.")
-    return Rig(streams, master, labels, _table(contents, "emulate", source), _table(contents, "live", source), text)
+    return Rig(streams, master, labels, _table(contents, "live", source), text)
 
 
 def _parse_stream(table: Values, source: str) -> RigStream:

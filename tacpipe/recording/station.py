@@ -14,6 +14,7 @@ from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import opening
 from tacpipe.links.link import DATAGRAM_SCHEMES, Link, LinkLostError, OpenLink
 from tacpipe.links.opening import NoReplyError
+from tacpipe.links.probing import SensorCandidate, recognise
 from tacpipe.recording import clock
 from tacpipe.recording.pace import CAUGHT_UP, STALLED, WAITED_NS, Pace
 from tacpipe.recording.rig import RigStream
@@ -352,8 +353,6 @@ def explain_silence(stream: RigStream, awaited: str, heard: Iterable[Chunks], *,
 
 def _explain_bytes(stream: RigStream, heard: Chunks, *, reply: bool) -> str:
     """Return a sentence on the sensor that sent the bytes, or an empty text if none is recognised."""
-    from tacpipe.links.probing import SensorCandidate, recognise
-
     scheme, expected = stream.address.scheme, SensorCandidate(stream.kind, stream.sensor)
     if reply and recognise(heard, scheme, [expected]):
         return (
@@ -373,8 +372,6 @@ def _explain_bytes(stream: RigStream, heard: Chunks, *, reply: bool) -> str:
 
 def _single_option_variants(expected: SensorCandidate, recognised: SensorCandidate) -> list[SensorCandidate]:
     """Return variants of the rig file's sensor, each with one option of the recognised sensor of the same kind."""
-    from tacpipe.links.probing import SensorCandidate
-
     sensor: Any = expected.sensor
     variants = []
     for option in fields(sensor):

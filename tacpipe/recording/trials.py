@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tacpipe.datasets import labels as labels_of
 from tacpipe.datasets.manifest import ACQUIRE
 from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import TacpipeError, UsageError
@@ -73,8 +74,6 @@ def recording_name(name: str | None) -> str:
 
 def attributes(labels: Sequence[str], note: str | None) -> dict[str, Attribute]:
     """Return labels and a note as attributes of a recording. Raises `UsageError` for malformed labels."""
-    from tacpipe.datasets import labels as labels_of
-
     parsed = labels_of.parse(labels, None, include=False) if labels else {}
     return {**parsed, **({"note": note} if note else {})}
 

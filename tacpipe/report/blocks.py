@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypedDict
+
+from tacpipe.io import JsonObject
 
 TINY = 1e-12  # numbers below this are zeros with a rounding error
 NONE = "–"  # shown in place of a missing number
@@ -77,7 +80,6 @@ class ChartAxis(TypedDict, total=False):
     ticks: bool
     domain: bool
     labelExpr: str
-    labelOverlap: bool
     labelAngle: float
     labelLimit: float
     labelPadding: float
@@ -95,6 +97,7 @@ class ChartLegend(TypedDict, total=False):
     direction: str
     columns: int
     labelLimit: float
+    symbolType: str
     symbolStrokeWidth: float
     symbolOpacity: float
 
@@ -139,7 +142,6 @@ class ChartEncoding(TypedDict, total=False):
     opacity: ChartChannel
     shape: ChartChannel
     strokeDash: ChartChannel
-    detail: ChartChannel
     text: ChartChannel
     row: ChartChannel
     tooltip: Sequence[ChartChannel]
@@ -159,7 +161,6 @@ class ChartMark(TypedDict, total=False):
     strokeWidth: float
     strokeDash: Sequence[int]
     fontSize: float
-    fontWeight: int
     tooltip: str | None
 
 
@@ -191,7 +192,6 @@ class Spec(TypedDict, total=False):
     height: int | dict[str, int]
     view: dict[str, str | None]
     facet: ChartChannel | ChartEncoding
-    columns: int
     spec: Spec
     resolve: dict[str, dict[str, str]]
     spacing: int
@@ -352,17 +352,6 @@ def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
     return Cell(signed(mean, digits), below, mean)
 
 
-def with_sd(mean: float, sd: float, digits: int = 4) -> Cell:
-    """Return mean ± standard deviation, without the latter if it is NaN; "–" if the mean is NaN.
-
-    >>> with_sd(0.05, 0.00123).text, with_sd(0.05, float("nan")).text
-    ('0.0500 ± 0.0012', '0.0500')
-    """
-    if math.isnan(mean):
-        return Cell(NONE)
-    return Cell(fixed(mean, digits) + ("" if math.isnan(sd) else f" ± {fixed(sd, digits)}"), value=mean)
-
-
 def p_value(p: float) -> Cell:
     """Return a p value with two digits, "< 0.0001" for a smaller one, "–" for NaN.
 
@@ -374,13 +363,21 @@ def p_value(p: float) -> Cell:
     return Cell("< 0.0001" if p < 1e-4 else f"{p:.2g}", value=p)
 
 
-def form(name: str, text: str, published: bool) -> str:
-    """Return a caption: in the form of the paper's table or figure ``name`` if ``published``, else only ``text``.
+def leaves(tree: JsonObject) -> dict[str, str]:
+    """Return nested values as text by the names that lead to them; "–" for None.
 
-    >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
-    ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
+    >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})
+    {'model, accuracy, biotac': '0.5', 'classes': '[1, 2]', 'p': '–'}
     """
-    return f"{name} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
+    texts: dict[str, str] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            texts.update({f"{name}, {path}": text for path, text in leaves(value).items()})
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            texts[name] = number(value).text
+        else:
+            texts[name] = NONE if value is None else json.dumps(value)
+    return texts
 
 
 def counted(count: int, plural: str) -> str:

@@ -1,10 +1,9 @@
-"""Read the content and origin of results, and collect the results of one task."""
+"""Read the content and origin of results, and define what a task adds to the page of its results."""
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
@@ -12,24 +11,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskReport
+from tacpipe.comparison.runs import MODEL, ComparedRun, Method, Settings, TaskResults
 from tacpipe.datasets.selection import PUBLISHED, is_simulated
-from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.model import ModelConfig
 from tacpipe.plugins.rows import TABLE_HEADS, table_of_rows
-from tacpipe.report import charts
-from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, fold, notes, table
-from tacpipe.report.charts import Curve, Spec
+from tacpipe.report.blocks import Block, Cell, Fold, notes, table
 from tacpipe.store.records import Step
-from tacpipe.training.following import Line, read_history
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.task import ModelConfig
 
 
 Config = TypeVar("Config", bound="ModelConfig")
@@ -53,11 +45,6 @@ class ReportResult(Generic[Config]):
         """The configuration of the model's training and evaluation."""
         config: Config = read_json(self.dataset, "config.json")
         return config
-
-    @cached_property
-    def history(self) -> Sequence[Line]:
-        """The lines of ``history.jsonl``, one per epoch; empty if training had no epochs."""
-        return read_history(self.dataset.files.get("history.jsonl", b""))
 
     @cached_property
     def params(self) -> Settings:
@@ -86,8 +73,12 @@ class ReportResult(Generic[Config]):
 
     @property
     def published(self) -> bool:
-        """Whether its recordings are those of the task's paper."""
-        return is_published(self.dataset, self.SETS)
+        """Whether all its recordings belong to sets of the task's paper, whose numbers apply only to them.
+
+        `tacpipe ingest` sets the attribute ``published`` of a recording to its set.
+        """
+        set_names = [str(shard.attributes.get(PUBLISHED) or "") for shard in self.dataset.recordings.values()]
+        return bool(set_names) and all(text and set(text.split(",")) <= set(self.SETS) for text in set_names)
 
 
 def read_json(result: Dataset, name: str) -> Any:
@@ -121,16 +112,6 @@ def _result_key(result: Dataset) -> str:
 SIMULATED = "These recordings were simulated, so the results are not evidence about real sensors."
 
 
-def is_published(result: Dataset, sets: Collection[str]) -> bool:
-    """Return whether all recordings of a result belong to published ``sets``.
-
-    The papers' numbers apply only to these data. `tacpipe ingest` sets the attribute ``published`` of a recording to
-    its set.
-    """
-    set_names = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.recordings.values()]
-    return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
-
-
 def provenance_blocks(result: Dataset) -> list[Block]:
     """Return the chain of stages that produced a dataset, with params, digests, and the rows that were read."""
     manifest = result.manifest
@@ -160,80 +141,47 @@ def provenance_blocks(result: Dataset) -> list[Block]:
     ]
 
 
-def loss_chart(
-    runs: Mapping[str, Sequence[Sequence[float]]], quantity: str, order: Sequence[str] = (), *, log: bool = False
-) -> Spec:
-    """Return a chart with a thin line per run, which has one value per epoch, and the mean over the runs of each name.
+class TaskReport(TaskResults):
+    """How results of one task are read, compared and reported.
 
-    The mean ends with the shortest run. NaN breaks a line.
+    A task's report is a subclass that overrides `read`, so that its results are compared, and the methods that add to
+    the page. An instance of this class reports results by their headlines and the numbers in ``metrics.json``.
     """
-    lines = []
-    for name, curves in runs.items():
-        if len(curves) > 1:
-            lines += [Curve(name, range(1, len(curve) + 1), curve, thin=True) for curve in curves]
-        length = min(map(len, curves))
-        mean = np.mean([curve[:length] for curve in curves], axis=0)
-        lines.append(Curve(name, range(1, length + 1), mean))
-    is_single_epoch = all(
-        len(curve) < 2 for curves in runs.values() for curve in curves
-    )  # a single value does not make a line
-    return charts.lines(lines, "epoch", quantity, order=order, log=log, points=is_single_epoch)
 
+    def uses(self, dataset: Dataset) -> bool:
+        """Return whether the page can use a dataset that is not a result."""
+        return False
 
-def read_coverage(results: Sequence[Dataset]) -> pd.DataFrame | None:
-    """Return the rows of the coverage files of results, joined, or None if no result is of a calibrated model."""
-    import pandas as pd
-
-    files = [result.files[COVERAGE_FILE] for result in results if COVERAGE_FILE in result.files]
-    return pd.concat([from_parquet(file).to_pandas() for file in files]) if files else None
-
-
-def band_fold(
-    levels: Sequence[int],
-    drawn: Sequence[Chart],
-    explained: str,
-    heads: Sequence[str],
-    rows: Sequence[Sequence[str | Cell]],
-    *more: Block,
-    about: str = "",
-) -> list[Fold]:
-    """Return the fold on bands between the outer ``levels`` in percent: charts of coverage, a table, and ``more``.
-
-    ``explained`` is the note between the charts and the table, with ``heads`` and ``rows``; ``about`` follows the
-    title.
-    """
-    title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
-    return fold("Uncertainty", Charts(drawn), notes(explained), table(title, heads, rows), *more, about=about)
-
-
-def without_gaps(values: Sequence[float | None]) -> list[float]:
-    """Return one value per epoch, NaN for epochs without one, or an empty list if no epoch has one.
-
-    >>> without_gaps([None, 1]), without_gaps([None, None])
-    ([nan, 1.0], [])
-    """
-    if all(value is None for value in values):
+    def columns(
+        self, context: Context, comparison: Comparison
+    ) -> Sequence[tuple[str, Callable[[ComparisonRow], Cell]]]:
+        """Return additional columns for the table of all methods, as pairs of a head and a function from row to cell."""
         return []
-    return [math.nan if value is None else float(value) for value in values]
 
+    def sentence(self, context: Context) -> tuple[str, str] | None:
+        """Return the first sentence of the section and its verdict, or None for how the best method compares."""
+        return None
 
-def curves_of_methods(methods: Sequence[Method], read: Callable[[Any], list[float]]) -> dict[str, list[list[float]]]:
-    """Return the curves that ``read`` returns for each method's results, by method name.
+    def folds(self, context: Context) -> Sequence[Fold]:
+        """Return the parts of the task's section after the comparison."""
+        return []
 
-    Methods without curves are omitted.
-    """
-    by_method = {method.name: [curve for result in method.details if (curve := read(result))] for method in methods}
-    return {name: curves for name, curves in by_method.items() if curves}
+    def caveats(self, context: Context) -> Sequence[str]:
+        """Return sentences about the limits of the numbers."""
+        return []
+
+    def run_columns(self, run: ComparedRun) -> dict[str, str | Cell]:
+        """Return additional columns for the table of runs, by head."""
+        return {}
 
 
 @dataclass(frozen=True)
 class Context:
-    """The results of one task with their comparisons, and related datasets."""
+    """The results of one task with their comparisons."""
 
     task: TaskReport
     methods: Sequence[Method]
     comparisons: Sequence[Comparison]
-    others: Sequence[Dataset] = ()  # datasets that are not results
     bare: Sequence[Dataset] = ()  # results without anything to compare
     traces: int = 0  # number of recordings that are drawn completely
     runs: Sequence[ComparedRun] = field(default=())

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.comparison.runs import TaskReport, by_task, report_on
+from tacpipe.comparison.runs import by_task, report_on
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
 from tacpipe.report.blocks import Block, Chart, Charts, Fold, Section, listed
+from tacpipe.report.context import TaskReport
 from tacpipe.report.frames import holds_cameras
 from tacpipe.report.sections import section
 
@@ -47,10 +50,23 @@ def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
         "script": Markup(_template("page.js")),
         "library": Markup(library),
     }
+    policy = _content_policy(parts["style"], [parts["script"], *([library] if has_charts else [])])
     text = environment.get_template("page.html").render(
-        sections=sections, title=title, heading=heading, charts=has_charts, **parts
+        sections=sections, title=title, heading=heading, charts=has_charts, policy=policy, **parts
     )
     return f"{text}\n".encode()
+
+
+def _content_policy(style: str, scripts: Sequence[str]) -> str:
+    """Return the policy that a browser enforces: only this style, these scripts and embedded images; no connections."""
+
+    def source(text: str) -> str:
+        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+    return (
+        f"default-src 'none'; script-src {' '.join(map(source, scripts))}; style-src {source(style)}; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 @functools.cache
@@ -135,7 +151,7 @@ def _render(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
     """Return the page as `render` does, without its check of result files. Raises `TacpipeError` as `render` does."""
     results = [dataset for dataset in datasets if "metrics.json" in dataset.files]
     extra_datasets = [dataset for dataset in datasets if "metrics.json" not in dataset.files]
-    tasks = {name: report_on(name) for name in by_task(results)}
+    tasks = {name: report_on(name, TaskReport) for name in by_task(results)}
     if not results or not all(_tasks_using(dataset, tasks) for dataset in extra_datasets):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
     sections = []

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.metrics import headline
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, interval, listed, number
+from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, listed, number
 from tacpipe.report.blocks import table as table_of
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context
+from tacpipe.scores import headline, words
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.pairing import Gain, Measure
 
 MAX_ROWS = 7  # maximum number of rows in the table
 SHOWN = 4  # number of methods, and of baselines, in a chart
@@ -29,22 +32,21 @@ def sentence(context: Context) -> tuple[str, str]:
     """
     clauses: list[str] = []
     verdicts: list[str] = []
-    last_name, last_finding = "", ("", "")
+    last_name = ""
     for part, comparisons in context.parts.items():
         method = context.winner(part)
-        rows = [(comparison, row) for comparison in comparisons if (row := context.row(comparison, method)) is not None]
-        if not rows or method is None:
+        compared = [
+            found
+            for comparison in comparisons
+            if (row := context.row(comparison, method)) is not None and (found := engine.headline(row, comparison))
+        ]
+        if not compared or method is None:
             continue
         # "it" refers to the method of the previous clause
         name = "it" if method.name == last_name else method.name
         last_name = method.name
-        verdicts += [row.gain.verdict for _, row in rows]
-        finding = (verdicts[-1], rows[0][1].baseline)
-        if name == "it" and len(rows) == 1 and finding == last_finding and verdicts[-1]:
-            clauses.append(f"on {part} too: {_amount(*rows[0])}")
-        else:
-            clauses.append(_clause(part, name, rows))
-        last_finding = finding
+        verdicts += [found.verdict for found in compared]
+        clauses.append(_clause(part, name, compared))
     if not clauses:
         return "", ""
     text = "; ".join(clauses[:2])
@@ -81,13 +83,27 @@ def first_chart(context: Context) -> Chart | None:
         return None
     measure = comparisons[0].measure
     better = "right" if measure.rises else "left"
-    caption = (
-        "Blue: methods; grey: baselines; dashed: the best baseline; bars: 95 % intervals. Values further to the "
-        f"{better} are better."
-    )
+    kinds = {dot.kind for dot in dots}
+    drawn = ["Blue: methods", *(["grey: baselines"] if "baseline" in kinds else [])]
+    drawn += ["dashed: the best baseline"] if levels else []
+    drawn += ["bars: 95 % intervals"] if any(dot.low < dot.high for dot in dots) else []
     part = f", {comparisons[0].question.part}" if has_panels and comparisons[0].question.part else ""
-    spec = charts.ranking(dots, measure.scored, level=levels, row=20 if has_panels else 24)
+    spec = charts.ranking(dots, with_unit(measure.scored), level=levels, row=20 if has_panels else 24)
+    if any(row["off"] or row["on_left"] or row["on_right"] for row in spec["data"]["values"]):
+        drawn.append("triangles: beyond the axis")
+    caption = f"{'; '.join(drawn)}. Values further to the {better} are better."
     return Chart(_capital(f"{measure.scored}{part}"), spec, caption)
+
+
+def with_unit(quantity: str) -> str:
+    """Return the title of an axis, which names a quantity and its unit.
+
+    >>> with_unit("accuracy (%)"), with_unit("skill")
+    ('accuracy (%)', 'skill (no unit)')
+    """
+    if quantity.endswith(")"):
+        return quantity
+    return f"{quantity} ({'percentage points' if quantity.startswith('points') else 'no unit'})"
 
 
 def first_table(context: Context) -> Table | None:
@@ -137,7 +153,7 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
     for part, compared in parts.items():
         method = context.winner(part)
         name = method.name if method else ""
-        heads += [f"{part}: {name}", "best baseline", compared[0].measure.name]
+        heads += [f"{part}: {name}", "best baseline", words.GAINS[compared[0].measure.name]]
     rows: list[Sequence[str | Cell]] = []
     for target in targets[:MAX_ROWS]:
         cells: list[str | Cell] = [target]
@@ -151,17 +167,29 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
             cells += [
                 number(row.values[0]),
                 Cell(number(best.values[0]).text, best.name) if best else NONE,
-                gain(comparison, row),
+                gain_cell(comparison.measure, row.gain),
             ]
         rows.append(cells)
     measure = next(iter(parts.values()))[0].measure
-    return table_of(f"{measure.columns[0]} by target, and {measure.name} over the best baseline", heads, rows)
+    return table_of(
+        f"{measure.columns[0]} by target, and {words.GAINS[measure.name]} than the best baseline", heads, rows
+    )
 
 
-def gain(comparison: Comparison, row: ComparisonRow) -> Cell:
-    """Return the gain of a row with its interval."""
-    digits = 1 if comparison.measure.name == "points" else 3
-    return interval(row.gain.mean, row.gain.low, row.gain.high, digits)
+def gain_cell(measure: Measure, gain: Gain) -> Cell:
+    """Return the cell of a gain with its interval below."""
+    if math.isnan(gain.mean):
+        return Cell(NONE)
+    below = words.format_interval(gain.low, gain.high, measure.name) if gain.low != gain.high else ""
+    return Cell(words.format_gain(gain.mean, measure.name), below, gain.mean)
+
+
+def error_cells(measure: Measure, values: Sequence[float]) -> list[Cell]:
+    """Return the cells of the columns of a measure."""
+    return [
+        Cell(text, value=None if math.isnan(value) else value)
+        for text, value in zip(words.cells(measure.columns, values), values, strict=True)
+    ]
 
 
 def _questions(context: Context) -> list[Comparison]:
@@ -191,8 +219,8 @@ def _heads(comparison: Comparison, single: bool) -> list[str]:
     columns = list(measure.columns[-2:]) if single else [measure.columns[-1]]
     prefix = "" if single or not comparison.question.part else f"{comparison.question.part}: "
     return [
-        *(f"{prefix}{name}" for name in columns),
-        f"{prefix}{measure.name} over baseline",
+        *(f"{prefix}{words.format_column(name)}" for name in columns),
+        f"{prefix}{words.GAINS[measure.name]} than the best baseline",
         *(["n"] if single else []),
     ]
 
@@ -201,54 +229,30 @@ def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> l
     """Return the cells of a method or baseline below `_heads`; dashes if it has no ``row``."""
     if row is None:
         return [NONE] * len(_heads(comparison, single))
-    values = row.values[-2:] if single else row.values[-1:]
+    errors = error_cells(comparison.measure, row.values)
     count = [Cell(f"{row.n:,}", value=row.n)] if single else []
-    compared = gain(comparison, row) if row.baseline else Cell("")
-    return [*(number(value) for value in values), compared, *count]
+    compared = gain_cell(comparison.measure, row.gain) if row.baseline else Cell("")
+    return [*(errors[-2:] if single else errors[-1:]), compared, *count]
 
 
-def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, ComparisonRow]]) -> str:
+def _clause(part: str, name: str, compared: Sequence[Headline]) -> str:
     """Return the clause of a sentence on the method ``name`` in a part: its verdict, or those of its targets."""
     prefix = f"on {part}, " if part else ""
-    if len(rows) == 1:
-        comparison, row = rows[0]
-        return f"{prefix}{name} {_verb(comparison, row)}"
+    if len(compared) == 1:
+        return f"{prefix}{name} {words.clause(compared[0])}"
     targets_by_verdict: dict[str, list[str]] = {}
-    for comparison, row in rows:
-        targets_by_verdict.setdefault(row.gain.verdict, []).append(comparison.question.target)
+    for found in compared:
+        targets_by_verdict.setdefault(found.verdict, []).append(found.target)
     counts = []
     for verdict in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
         if verdict in targets_by_verdict:
-            is_all = len(targets_by_verdict[verdict]) == len(rows)
-            targets = f"all {len(rows)} targets" if is_all else f"{listed(targets_by_verdict[verdict])}"
+            is_all = len(targets_by_verdict[verdict]) == len(compared)
+            targets = f"all {len(compared)} targets" if is_all else f"{listed(targets_by_verdict[verdict])}"
             counts.append(f"{CLAUSES[verdict]} the best baseline on {targets}")
+    size = words.format_count(compared[0].clusters, compared[0].cluster)
     if not counts:
-        return f"{prefix}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
-    return f"{prefix}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
-
-
-def _verb(comparison: Comparison, row: ComparisonRow) -> str:
-    """Return the end of a sentence on a method: whether it is better and by how much, or why there is no verdict."""
-    size = counted(row.n, comparison.measure.cluster)
-    if not row.baseline:
-        return f"was evaluated without a baseline, on {size}"
-    verdict = row.gain.verdict
-    if verdict == headline.NO_VERDICT:
-        warning = headline.explain_no_verdict(row.n, comparison.measure.cluster, row.gain.effective)
-        return f"has {_format_gain(comparison, row)} over the best baseline, {row.baseline}; {warning}"
-    return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(comparison, row, '95 % interval ')}"
-
-
-def _amount(comparison: Comparison, row: ComparisonRow, called: str = "") -> str:
-    """Return a phrase with a gain, its interval and its basis."""
-    ends = [headline.format_gain(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
-    interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
-    return f"{_format_gain(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
-
-
-def _format_gain(comparison: Comparison, row: ComparisonRow) -> str:
-    gained = headline.format_gain(row.gain.mean, comparison.measure.name)
-    return f"{gained} points" if comparison.measure.name == "points" else f"{comparison.measure.name} {gained}"
+        return f"{prefix}{name} was evaluated on {size}, too few for a verdict"
+    return f"{prefix}{name} is {listed(counts)} ({size})"
 
 
 def _capital(text: str) -> str:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
-from tacpipe.comparison.runs import MODEL, TaskReport, grouped
+from tacpipe.comparison.runs import MODEL, grouped
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import is_simulated
-from tacpipe.io import JsonObject
-from tacpipe.metrics import headline, pairing
-from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, context, frames, screen
 from tacpipe.report.blocks import (
     NONE,
@@ -32,7 +30,12 @@ from tacpipe.report.blocks import (
     table,
 )
 from tacpipe.report.blocks import Row as Line
-from tacpipe.report.context import SIMULATED, Context, median_run, provenance_blocks
+from tacpipe.report.context import SIMULATED, Context, TaskReport, drop_duplicates, median_run, provenance_blocks
+from tacpipe.report.differences import difference_folds
+from tacpipe.report.papers import paper_folds
+from tacpipe.report.training import history_of, training_folds
+from tacpipe.scores import headline, pairing, words
+from tacpipe.scores.pairing import Gain, Measure
 
 
 def metrics_sentence(results: Sequence[Dataset]) -> str:
@@ -40,7 +43,7 @@ def metrics_sentence(results: Sequence[Dataset]) -> str:
     for result in results:
         headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
         if headlines:
-            return headline.sentence(headlines[0])
+            return words.sentence(headlines[0])
     counts = [context.read_json(result, "metrics.json").get("counts") for result in results]
     if all(count is not None and not count.get("recordings", count.get("n", True)) for count in counts):
         return "All recordings were used for training or contain no window, so there is nothing to evaluate."
@@ -51,9 +54,9 @@ def metric_folds(result: Dataset, number: int, count: int) -> list[Fold]:
     """Return the fold of result ``number`` of ``count``: its headlines, metrics and provenance."""
     config = context.read_json(result, "config.json")
     name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
-    rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
+    rows = [[name, value] for name, value in blocks.leaves(context.read_json(result, "metrics.json")).items()]
     headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
-    headline_blocks = [table("Model and best baseline", *headline.table(headlines))] if headlines else []
+    headline_blocks = [table("Model and best baseline", *words.table(headlines))] if headlines else []
     title = f"{f'{number}. ' if count > 1 else ''}{name.replace('_', ' ')}"
     return [
         Fold(
@@ -63,28 +66,11 @@ def metric_folds(result: Dataset, number: int, count: int) -> list[Fold]:
     ]
 
 
-def leaves(tree: JsonObject) -> dict[str, str]:
-    """Return nested values as text by the names that lead to them; "–" for None.
-
-    >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})
-    {'model, accuracy, biotac': '0.5', 'classes': '[1, 2]', 'p': '–'}
-    """
-    texts: dict[str, str] = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            texts.update({f"{name}, {path}": text for path, text in leaves(value).items()})
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            texts[name] = number(value).text
-        else:
-            texts[name] = NONE if value is None else json.dumps(value)
-    return texts
-
-
 RECORDINGS = 60  # maximum number of rows in a table of recordings
 DOTS = 400  # maximum number of recordings in a chart
 KINDS = {
     "baseline": "Baselines",
-    "variant": "Variants of the forecasts",
+    "variant": "Variants of the methods",
     "oracle": "Oracles, which use the true future",
     "control": "Controls",
 }
@@ -103,13 +89,16 @@ def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequen
     runs = task.read(results)
     methods = grouped(runs, task.usual)
     evaluated = {id(run.dataset) for run in runs}
-    bare = [result for result in results if id(result) not in evaluated]  # results that only have metrics
-    context = Context(task, methods, engine.comparisons(task, methods), extra_datasets, bare, traces, runs)
+    bare = [result for result in drop_duplicates(results) if id(result) not in evaluated]  # they only have metrics
+    context = Context(task, methods, engine.comparisons(task, methods), bare, traces, runs)
     sentence, verdict = task.sentence(context) or screen.sentence(context)
     bare_folds = [fold for number, result in enumerate(bare, 1) for fold in metric_folds(result, number, len(bare))]
     folds = [
         *method_folds(context),
+        *difference_folds(context),
+        *paper_folds(context),
         *task.folds(context),
+        *training_folds(context),
         *frames.frame_folds([outcome for run in runs[:1] for outcome in task.outcomes(run)], extra_datasets),
         *recording_folds(context),
         *run_folds(context),
@@ -155,12 +144,11 @@ def method_folds(context: Context) -> list[Fold]:
 
 def headline_caption(measure: Measure) -> str:
     """Return the meaning of a measure's columns, as notes below a table."""
-    skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
-    points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
     return (
-        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 % intervals "
+        f"Units: {measure.unit}. {words.explain_gain(measure.name, measure.ranked_by)} Intervals are 95 % intervals "
         f"over {measure.cluster} (and seeds, if there are several), with method and baseline on the same "
-        f"{measure.cluster}. They account for the choice of the best among several methods and baselines."
+        f"{measure.cluster}. They account for the choice of the best baseline; the sentence about the best method also "
+        f"accounts for the choice of the method."
     )
 
 
@@ -181,25 +169,22 @@ def _table(context: Context, comparison: Comparison) -> Table:
         rows = comparison.of(kind)  # type: ignore[arg-type]
         if rows:
             groups.append(Group([_line(comparison, row, task_columns, "quiet") for row in rows], title))
-    score = [] if _is_score_column(comparison) else [comparison.measure.scored]
-    heads = [
-        "",
-        *comparison.measure.columns,
-        *score,
-        "interval",
-        "sd over runs",
-        f"{comparison.measure.name} over the best baseline",
-    ]
-    counts = dict.fromkeys([comparison.measure.cluster, "recordings", "runs"])
-    heads += ["best baseline", "p", *(head for head, _ in task_columns), *counts]
+    measure = comparison.measure
+    scored = [] if _score_column(comparison) is not None else [measure.scored]
+    gained = f"{words.GAINS[measure.name]} than the best baseline"
+    heads = ["", *map(words.format_column, measure.columns), *scored, "sd over runs", gained]
+    heads += ["best baseline", "p", *(head for head, _ in task_columns), *_counts_of(comparison, comparison.rows[0])]
     return Table(comparison.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
 
-def _is_score_column(comparison: Comparison) -> bool:
-    """Return whether the score is already among the columns."""
-    return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in comparison.rows) or all(
-        row.score.mean == row.values[0] for row in comparison.rows
-    )
+def _score_column(comparison: Comparison) -> int | None:
+    """Return the index of the column that has the score, the last or the first, up to rounding; None if none has it."""
+    scores = [row.score.mean for row in comparison.rows]
+    for at in (len(comparison.measure.columns) - 1, 0):
+        values = [row.values[at] for row in comparison.rows]
+        if np.allclose(values, scores, rtol=1e-9, atol=1e-12, equal_nan=True):
+            return at
+    return None
 
 
 def _line(
@@ -209,15 +194,32 @@ def _line(
     kind: str,
 ) -> Line:
     """Return the line of a method or baseline in `_table`; ``extra`` are further columns, (head, function of the row)."""
-    score = row.score
-    interval = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
-    cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
-    cells += [] if _is_score_column(comparison) else [number(score.mean)]
-    cells += [interval, number(row.spread, 3), screen.gain(comparison, row), row.baseline or NONE, p_value(row.p)]
+    score, column = row.score, _score_column(comparison)
+    name = "" if column is None else comparison.measure.columns[column]
+    score_text, *ends = (words.format_value(name, value) for value in (score.mean, score.low, score.high))
+    score_cell = Cell(score_text, "" if ends[0] == ends[1] else " to ".join(ends), number(score.mean).value)
+    cells: list[str | Cell] = [row.name, *screen.error_cells(comparison.measure, row.values)]
+    if column is None:
+        cells.append(score_cell)
+    else:
+        cells[1 + column] = score_cell
+    cells += [
+        number(row.spread, 3),
+        screen.gain_cell(comparison.measure, row.gain),
+        row.baseline or NONE,
+        p_value(row.p),
+    ]
     cells += [make(row) for _, make in task_columns]
-    counts = {comparison.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
-    cells += [Cell(f"{count:,}", value=count) for count in counts.values()]
+    cells += [Cell(f"{count:,}", value=count) for count in _counts_of(comparison, row).values()]
     return Line(cells, kind)
+
+
+def _counts_of(comparison: Comparison, row: ComparisonRow) -> dict[str, int]:
+    """Return the counts of a row by head: clusters, recordings if they are not the clusters of any row, and runs."""
+    counts = {comparison.measure.cluster: row.n}
+    if any(other.n != other.recordings for other in comparison.rows):
+        counts["recordings"] = row.recordings
+    return {**counts, "runs": row.runs}
 
 
 def recording_folds(context: Context) -> list[Fold]:
@@ -260,13 +262,12 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
     gains = np.asarray(measure.gain(errors, baseline_errors), np.float64)
     worst_first = sorted(range(len(names)), key=lambda index: (np.isnan(errors[index]), -errors[index], names[index]))
     with_errors = [index for index in worst_first if errors[index] != 0]
-    digits = 1 if measure.name == "points" else 3
     rows: list[Sequence[str | Cell]] = []
     for index in with_errors[:RECORDINGS]:
         name, gain = names[index], float(gains[index])
-        values = [number(value) for value in measure.values(model_sums[name])]
+        values = screen.error_cells(measure, measure.values(model_sums[name]))
         baseline_cell = number(measure.values(baseline_sums[name])[0]) if name in baseline_sums else Cell(NONE)
-        gain_cell = Cell(blocks.signed(gain, digits), value=None if np.isnan(gain) else gain)
+        gain_cell = screen.gain_cell(measure, Gain(gain, math.nan, math.nan))
         rows.append(
             [Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, baseline_cell, gain_cell]
         )
@@ -276,12 +277,20 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
     if len(defined) > 3 and measure.cluster == "recordings":
         best_first = [index for index in np.argsort(-gains, kind="stable") if not np.isnan(gains[index])]
         ranks = np.unique(np.linspace(0, len(best_first) - 1, min(len(best_first), DOTS)).astype(int))
+        scale = 100.0 if measure.name == "skill" else 1.0
         dots = [
-            {"x": float(x), "y": float(gains[best_first[rank]]), "name": row.name, "tip": names[best_first[rank]]}
+            {
+                "x": float(x),
+                "y": scale * float(gains[best_first[rank]]),
+                "name": row.name,
+                "tip": names[best_first[rank]],
+            }
             for x, rank in enumerate(ranks, 1)
         ]
-        quantity = f"{measure.name} over {row.baseline}"
-        spec = charts.scatter(dots, "recordings, the best first", quantity, level=("", 0.0), legend=False, height=170)
+        quantity = screen.with_unit(f"{words.GAINS[measure.name]} than {row.baseline}{' (%)' if scale > 1 else ''}")
+        spec = charts.scatter(
+            dots, "rank of the recording (best first)", quantity, level=("", 0.0), legend=False, height=170
+        )
         charts_of_gains.append(
             Chart(f"{title}, better than {row.baseline} on {int((defined > 0).sum())} of {len(defined)}", spec)
         )
@@ -290,7 +299,7 @@ def _recording_table(comparison: Comparison, row: ComparisonRow) -> list[blocks.
         f"; {len(names) - len(with_errors):,} of {len(names):,} have no error" if len(with_errors) < len(names) else ""
     )
     baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
-    heads = ["recording", *measure.columns, baseline_head, measure.name]
+    heads = ["recording", *map(words.format_column, measure.columns), baseline_head, words.GAINS[measure.name]]
     if not rows:
         return [*charts_of_gains, SmallPrint(f"{title}: none of the {len(names):,} has an error.")]
     return [*charts_of_gains, blocks.table(f"{title}, {about}{without_errors}", heads, rows)]
@@ -310,13 +319,14 @@ def run_folds(context: Context) -> list[Fold]:
                 sums = errors.sums.get(MODEL, {}) if errors else {}
                 score = number(comparison.measure.score_of(sums.values())) if sums else NONE
                 cells += [score, f"{len(sums):,}" if sums else NONE]
-            rows.append([*cells, *context.task.run_columns(run).values()])
+            epochs = max((line["epoch"] for line in history_of(run)), default=0)
+            rows.append([*cells, str(epochs or NONE), *context.task.run_columns(run).values()])
     if not rows:
         return []
     heads: list[str] = ["", "fold", "seed"]
     for comparison in context.comparisons:
         heads += [f"{comparison.question.where}: {comparison.measure.scored}", "recordings"]
-    heads += list(context.task.run_columns(context.runs[0]))
+    heads += ["epochs", *context.task.run_columns(context.runs[0])]
     return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
 
 

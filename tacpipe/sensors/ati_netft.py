@@ -18,12 +18,11 @@ from tacpipe.arrays import AnyArray, Bytes, Floats
 from tacpipe.channels import schema
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 REQUEST = struct.Struct(">HHI")  # 0x1234, command, records
 MAGIC = 0x1234
 STOP, START, BIAS = 0, 2, 0x42
-STARTS = (1, START, 3)  # 1 is for newer boxes; 3 buffers records if the box is configured to
 RECORD = np.dtype([("rdt_seq", ">u4"), ("ft_seq", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)])
 BIAS_S = 0.1  # time that the box needs to zero its load
 
@@ -117,31 +116,6 @@ class AtiNetFT(Sensor):
     def taring(self) -> Dialogue:
         """Zero the load."""
         yield Ask(request(BIAS), pause_s=BIAS_S)
-
-    def device(self) -> Device:
-        """Return a box that waits for a request."""
-        return _Box(streaming=False)
-
-
-class _Box(Device):
-    """An emulated box: it streams without limit, or sends the requested number of records."""
-
-    requested = 0
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Start or stop sending on request; other packets are ignored. There are no replies."""
-        if len(data) != REQUEST.size:
-            return []
-        magic, command, count = REQUEST.unpack(data)
-        if magic == MAGIC and command in STARTS:
-            self.streaming, self.requested = count == 0, self.requested + count
-        elif magic == MAGIC and command == STOP:
-            self.streaming, self.requested = False, 0
-        return []
-
-    def polled(self) -> int:
-        requested, self.requested = self.requested, 0
-        return requested
 
 
 def request(command: int, records: int = 0) -> bytes:

@@ -26,7 +26,7 @@ from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
 from tacpipe.sensors.pts import FreshFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 RATES = (100, 250, 500, 1000)
 COUNTER = 1 << 32
@@ -196,24 +196,6 @@ class Contactile(Sensor):
     def taring(self) -> Dialogue:
         """Zero the load. Nothing may touch the pillars for the two seconds that this takes."""
         yield Ask(b"z\n", pause_s=2.0)
-
-    def device(self) -> Device:
-        """Return an emulated controller that streams from power-on at the rate that was set last."""
-        return _ContactileController()
-
-
-class _ContactileController(Device):
-    """An emulated controller, which receives lines of text and does not answer."""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process commands of the host, of which only the rate has an effect. There are no replies."""
-        self.heard += data
-        while (stop := self.heard.find(b"\n")) >= 0:
-            line = bytes(self.heard[:stop])
-            del self.heard[: stop + 1]
-            if line[:1] == b"f" and line[1:].isdigit() and int(line[1:]) in RATES:
-                self.rate_hz = float(line[1:])
-        return []
 
 
 def _vector_fields(prefix: str, layout: Mapping[str, str], quantity: str, unit: str) -> list[pa.Field]:

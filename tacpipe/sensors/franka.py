@@ -19,7 +19,7 @@ from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.channels import schema
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer, PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
 
 VERSION = 10
@@ -161,35 +161,6 @@ class Franka(Sensor):
             )
         if status != DONE:
             raise DeviceError(f"The arm refused the connection with status {status}. Activate FCI in Desk.")
-
-    def device(self) -> Device:
-        """Return an arm that waits for a connection."""
-        return _Arm(streaming=False)
-
-
-class _Arm(Device):
-    """An emulated arm.
-
-    It sends its state to ``port`` once a connection has set it, and answers no other command.
-    """
-
-    port: int | None = None
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process messages of the host, and return the replies: a connection with the right version starts the stream."""
-        self.heard += data
-        replies = []
-        while (size := message_size(bytes(self.heard))) > 0:
-            message = bytes(self.heard[:size])
-            del self.heard[:size]
-            command, number, _ = HEADER.unpack_from(message)
-            if command == CONNECT_COMMAND and size == CONNECT.size:
-                _, _, _, version, port = CONNECT.unpack(message)
-                status = DONE if version == VERSION else OTHER_VERSION
-                replies.append(CONNECTED.pack(command, number, CONNECTED.size, status, VERSION))
-                if status == DONE:
-                    self.streaming, self.port = True, port
-        return replies
 
 
 def message_size(data: bytes) -> int:

@@ -28,7 +28,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing, PacketFramer
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 MAX_SIZE = 4096  # maximum size of a frame in bytes
 
@@ -266,11 +266,6 @@ class Generic(layout.DescribedSensor):
     def closing(self) -> bytes:
         """Return ``stop``."""
         return _bytes("stop", self.stop)
-
-    def device(self) -> Device:
-        """Return an emulated board that streams from the start, or between the commands ``start`` and ``stop``."""
-        start, stop = _bytes("start", self.start), _bytes("stop", self.stop)
-        return layout.Board(streaming=not start, start=start, stop=stop)
 
 
 def _channels_of_number(number: layout.Number) -> list[tuple[str, dict[str, str]]]:

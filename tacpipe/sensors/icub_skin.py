@@ -23,7 +23,7 @@ import pyarrow as pa
 from tacpipe.arrays import Bools, Bytes, Int64s, Times
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Framer, FrameRun, FramingLoss
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 TORN = "torn"  # a scan with missing CAN frames
 CAN = 13  # bytes of a CAN frame: identifier (4), length (1), data (8)
@@ -275,31 +275,3 @@ class IcubSkin(Sensor):
 
     def _command(self, *data: int, pause_s: float = 0.0) -> Ask:
         return Ask(can_frame(POLLING << 8 | self.board, bytes(data)), pause_s=pause_s)
-
-    def device(self) -> Device:
-        """Return an emulated board that waits for the start command."""
-        return _Board(self)
-
-
-class _Board(Device):
-    """An emulated board."""
-
-    def __init__(self, sensor: IcubSkin) -> None:
-        super().__init__(streaming=False)
-        self.sensor = sensor
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process CAN frames of the host, which set the rate and start or stop the stream. There are no replies."""
-        self.heard += data
-        while len(self.heard) >= CAN:
-            message = bytes(self.heard[:CAN])
-            del self.heard[:CAN]
-            if int.from_bytes(message[:4], "little") != POLLING << 8 | self.sensor.board:
-                continue
-            if message[DATA] == TRANSMIT and not self.sensor.old:
-                self.streaming = message[DATA + 1] == 0
-            elif message[DATA] == BOARD and message[DATA + 2]:
-                self.rate_hz = 1000 / message[DATA + 2]
-            elif message[DATA] == OLD_TIMING and self.sensor.old:
-                self.streaming = True
-        return []

@@ -20,13 +20,13 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, SerialLine
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor, SerialLine
 
 TAIL = b"\x00\x00\x80\x7f"
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 FULAI = {"fulai-3.0": 415, "fulai-3.1": 401, "fulai-3.2": 615}  # floats in a frame, by hardware
 RESERVED = {"fulai-3.2": (*range(82, 90), *range(530, 537))}  # unused floats, counted from 0
-ON, OFF, INFO = b"vofa on\r\n", b"vofa off\r\n", b"bridge info get\r\n"
+ON, OFF = b"vofa on\r\n", b"vofa off\r\n"
 MAX_CHANNELS = 1000
 
 
@@ -109,31 +109,6 @@ class JustFloat(Sensor):
     def closing(self) -> bytes:
         """Stop the stream of a fulai."""
         return OFF if self.model != "any" else b""
-
-    def device(self) -> Device:
-        """Return an emulated board that streams from the start, or a fulai that accepts its three commands."""
-        return Device() if self.model == "any" else _Bridge(model=self.model, streaming=False)
-
-
-@dataclass
-class _Bridge(Device):
-    """An emulated fulai, whose commands are lines of text."""
-
-    model: str = ""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process lines of the host: start and stop the stream, or return the reply with the model."""
-        self.heard += data
-        replies = []
-        while (stop := self.heard.find(b"\n")) >= 0:
-            command = bytes(self.heard[: stop + 1]).strip()
-            del self.heard[: stop + 1]
-            if command in (ON.strip(), OFF.strip()):
-                self.streaming = command == ON.strip()
-            elif command == INFO.strip():
-                hardware = self.model.removeprefix("fulai-")
-                replies.append(f"OK BRIDGE MODEL=FULAI FW=1.0 HW=V{hardware} PROTOCOL=VOFA HAND=LEFT\r\n".encode())
-        return replies
 
 
 def _floats(frames: Bytes) -> Float32s:

@@ -25,7 +25,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import number_texts
 from tacpipe.sensors.byte_framer import TextFramer
 from tacpipe.sensors.framing import Framer
-from tacpipe.sensors.sensor import Device, Samples, Sensor
+from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.signals import kinematics
 
 CYCLES_MS = (4, 12)
@@ -118,10 +118,6 @@ class KukaRsi(Sensor):
         if match is None:
             return b""
         return b'<Sen Type="%b"><IPOC>%b</IPOC></Sen>' % (self.sen_type.encode(), match[1])
-
-    def device(self) -> Device:
-        """Return an emulated controller that sends from the start and ignores answers."""
-        return Device()
 
 
 @functools.lru_cache(maxsize=CACHED)

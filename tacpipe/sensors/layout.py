@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Bytes, Int64s
 from tacpipe.errors import UsageError
 from tacpipe.sensors import checks
-from tacpipe.sensors.sensor import Device, Sensor
+from tacpipe.sensors.sensor import Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 Type = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64"]
@@ -268,21 +268,3 @@ def device_ns(ticks: AnyArray, unit: str) -> Int64s:
     if ticks.dtype.kind == "f":
         return np.rint(ticks * float(UNITS_NS[unit])).astype(np.int64)
     return ticks.astype(np.int64) * UNITS_NS[unit]
-
-
-@dataclass
-class Board(Device):
-    """An emulated board that streams between the commands ``start`` and ``stop``."""
-
-    start: bytes = b""
-    stop: bytes = b""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Start or stop the stream, according to the last command of the host. There are no replies."""
-        self.heard += data
-        started = self.heard.rfind(self.start) if self.start else -1
-        stopped = self.heard.rfind(self.stop) if self.stop else -1
-        if started != stopped:
-            self.streaming = started > stopped
-            del self.heard[: max(started + len(self.start), stopped + len(self.stop))]
-        return []

@@ -30,10 +30,10 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import layout, line_layout, sensor
 from tacpipe.sensors.byte_framer import LineFramer, TextFramer
 from tacpipe.sensors.framing import Framer
-from tacpipe.sensors.layout import Board, DescribedSensor, device_ns
+from tacpipe.sensors.layout import DescribedSensor, device_ns
 from tacpipe.sensors.line_layout import LineCell, LineClock, LineColumn, LineNumbers, LineSum, Parser, line_sums
 from tacpipe.sensors.line_layout import LineSequence as Counter
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, Frames, LocalAddress, Samples
+from tacpipe.sensors.sensor import Ask, Dialogue, Frames, LocalAddress, Samples
 
 MAX_SIZE = 1 << 16  # maximum size of a line in bytes
 ParsedBatch = tuple[Int64s | None, LineNumbers]  # indices of lines with a sample (None: all), and their numbers
@@ -251,11 +251,6 @@ class Lines(DescribedSensor):
     def closing(self) -> bytes:
         """Return ``stop``."""
         return self.stop.encode()
-
-    def device(self) -> Device:
-        """Return an emulated board that streams from the start, or between the commands ``start`` and ``stop``."""
-        start, stop = self.start.encode(), self.stop.encode()
-        return Board(streaming=not start, start=start, stop=stop)
 
 
 @functools.lru_cache(maxsize=CACHED)

@@ -8,7 +8,7 @@ Source: the package tactile-pressure-sdk 2.0.0 (MIT); MODBUS over Serial Line V1
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -20,16 +20,13 @@ from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_modbus
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
-READ_REGISTERS, WRITE_REGISTER, INFO, PRESSURES = 0x03, 0x06, 0x41, 0x42  # functions
+READ_REGISTERS, WRITE_REGISTER, PRESSURES = 0x03, 0x06, 0x42  # functions
 REFUSED = 0x80  # bit of the function in a reply that reports an error
-ADDRESS, SENDING, SENDING_HZ, UNIT, COUNT, ZERO = 0x01, 0x0B, 0x0C, 0x0D, 0x0F, 0x12  # registers
+SENDING, UNIT, COUNT, ZERO = 0x0B, 0x0D, 0x0F, 0x12  # registers
 REFUSALS = {1: "unknown function", 2: "unknown register", 3: "value out of range"}
-BROADCAST, HEADER = 0, 4
-INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # texts of the emulated device
-# registers after power-up
-REGISTERS = {ADDRESS: 1, SENDING: 0, SENDING_HZ: 100, UNIT: 1, COUNT: 60, 0x0E: 20, 0x10: 250}
+HEADER = 4
 
 
 @dataclass(frozen=True)
@@ -111,66 +108,6 @@ class ModbusTactile(Sensor):
             until=_reply_finder(self.address, function, size),
             what=description,
         )
-
-    def device(self) -> Device:
-        """Return an emulated module that waits for requests."""
-        registers = {**REGISTERS, ADDRESS: self.address, COUNT: self.points}
-        return _Module(streaming=False, registers=registers)
-
-
-@dataclass
-class _Module(Device):
-    """An emulated module: it counts requests for taxels, reads and writes registers, and returns its identity."""
-
-    registers: dict[int, int] = field(default_factory=dict)
-    requests: int = 0
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to requests with the right checksum; other bytes are skipped."""
-        self.heard += data
-        replies = []
-        while len(self.heard) >= HEADER:
-            sizes = {READ_REGISTERS: 8, WRITE_REGISTER: 8, INFO: 5}
-            size = sizes.get(self.heard[1], HEADER)
-            if len(self.heard) < size:
-                break
-            message = bytes(self.heard[:size])
-            if with_crc(message[:-2]) != message:
-                del self.heard[:1]
-                continue
-            del self.heard[:size]
-            if message[0] not in (BROADCAST, self.registers[ADDRESS]):
-                continue
-            reply = self._answer(message[1], message[2:-2])
-            if reply is not None and message[0] != BROADCAST:
-                replies.append(with_crc(message[:1] + reply))
-        return replies
-
-    def _answer(self, function: int, data: bytes) -> bytes | None:
-        """Return function and data of a reply, or None for a request of taxels, which only increases ``requests``."""
-        if function == PRESSURES:
-            self.requests += 1
-            return None
-        register, value = int.from_bytes(data[:2], "big"), int.from_bytes(data[2:4], "big")
-        if function == READ_REGISTERS:
-            addresses = range(register, register + value)
-            if any(number not in self.registers for number in addresses):
-                return bytes([function | REFUSED, 2])
-            content = b"".join(self.registers[number].to_bytes(2, "big") for number in addresses)
-            return bytes([function, len(content)]) + content
-        if function == WRITE_REGISTER:
-            if register == COUNT:
-                return bytes([function | REFUSED, 2])
-            if register in self.registers:
-                self.registers[register] = value
-            return bytes([function]) + data
-        if function == INFO and data[0] in INFOS:
-            return bytes([function, data[0], len(INFOS[data[0]])]) + INFOS[data[0]]
-        return bytes([function | REFUSED, 1])
-
-    def polled(self) -> int:
-        requests, self.requests = self.requests, 0
-        return requests
 
 
 def with_crc(body: bytes) -> bytes:

@@ -18,7 +18,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum16
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 LENGTHS = {3: 0x0A, 6: 0x10, 12: 0x1C}  # last byte of the header by number of axes
 SPEEDS = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # rate in Hz -> byte of the command
@@ -103,25 +103,6 @@ class OptoForce(Sensor):
 
     def _configure(self, speed: int, zero: int = 0) -> bytes:
         return with_sum(CONFIGURE + bytes([speed, FILTERS[self.filter_hz], zero]))
-
-    def device(self) -> Device:
-        """Return an emulated DAQ that waits for its configuration."""
-        return _Daq(streaming=False)
-
-
-class _Daq(Device):
-    """An emulated DAQ: it streams at the rate that was set last, and not after a stop."""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process configurations of the host, which set the rate or stop the stream. There are no replies."""
-        self.heard += data
-        while (start := self.heard.find(CONFIGURE)) >= 0 and len(self.heard) >= start + 9:
-            message = bytes(self.heard[start : start + 9])
-            del self.heard[: start + 9]
-            if with_sum(message[:7]) == message:
-                rates = {speed: rate for rate, speed in SPEEDS.items()}
-                self.streaming, self.rate_hz = message[4] != STOP, rates.get(message[4])
-        return []
 
 
 def with_sum(body: bytes) -> bytes:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -24,12 +24,11 @@ from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import lrc
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 REQUEST, REPLY, PUSH = b"\x55\xaa\x00", b"\xaa\x55\x00", b"\xaa\x56\x00"
 READ_FUNCTION, WRITE_FUNCTION, CALIBRATE_FUNCTION = 0x03, 0x10, 0x17
 VERSION, ACTIVE, DATA_TYPE, PUSHING, POINTS, CALIBRATION = 0x00, 0x10, 0x16, 0x17, 0x30, 0x02  # registers
-RESET = 0x22
 REPLY_HEADER, PUSH_HEADER = 8, 6
 
 
@@ -74,53 +73,6 @@ def unpack_uint(data: bytes | bytearray) -> int:
 def has_valid_sum(frame: bytes) -> bool:
     """Return whether all bytes of a message add up to 0."""
     return sum(frame) & 0xFF == 0
-
-
-@dataclass
-class RegisterBoard(Device):
-    """An emulated board with registers. One of them starts and stops the stream."""
-
-    memory: dict[int, bytes] = field(default_factory=dict)
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to messages. Invalid bytes are skipped."""
-        self.heard += data
-        replies = []
-        while (start := self.heard.find(REQUEST)) >= 0 and len(self.heard) >= start + REPLY_HEADER:
-            function, register = self.heard[start + 3], unpack_uint(self.heard[start + 4 : start + 6])
-            length = unpack_uint(self.heard[start + 6 : start + 8])
-            size = REPLY_HEADER + 1 + (0 if function == READ_FUNCTION else length)
-            if len(self.heard) < start + size:
-                break
-            request = bytes(self.heard[start : start + size])
-            if not has_valid_sum(request):
-                del self.heard[: start + 1]
-                continue
-            del self.heard[: start + size]
-            replies += self._answer(function, register, length, request[REPLY_HEADER:-1])
-        return replies
-
-    def _answer(self, function: int, register: int, length: int, data: bytes) -> list[bytes]:
-        """Return the replies to one message: to a read the content, and to a write the result.
-
-        Some writes have effects.
-        """
-        if function == READ_FUNCTION:
-            content = b""
-            for base, memory in self.memory.items():
-                if base <= register < base + len(memory):
-                    content = memory[register - base : register - base + length]
-            return [message(function, register, content.ljust(length, b"\x00"), REPLY)]
-        if (function, register) == (WRITE_FUNCTION, PUSHING):
-            self.streaming = data == b"\x01"
-            if self.streaming:
-                return [with_sum(PUSH + pack_uint16(1) + b"\x00")]
-        if (function, register) == (WRITE_FUNCTION, RESET):
-            self.streaming = False
-            return []
-        if function == WRITE_FUNCTION:
-            self.memory[register] = data
-        return [message(function, register, b"\x00", REPLY)]
 
 
 FINGERS, PHALANGES = ("thumb", "index", "middle", "ring", "little"), ("proximal", "middle", "tip", "nail")
@@ -263,13 +215,6 @@ class Paxini(Sensor):
             raise DeviceError(
                 f"The board could not be zeroed: error {_data(reply)[0]}. Remove all load, and try again."
             )
-
-    def device(self) -> Device:
-        """Return an emulated board with these modules that waits for the start command."""
-        counts = b"".join(pack_uint16(self.points.get(slot, 0)) for slot in SLOTS)
-        bits = sum(1 << SLOTS.index(module) for module in self.modules)
-        memory = {VERSION: b"PX-HS V1.0.0".ljust(15, b"\x00"), ACTIVE: bits.to_bytes(4, "little"), POINTS: counts}
-        return RegisterBoard(streaming=False, memory={**memory, DATA_TYPE: b"\x03"})
 
     @functools.cached_property
     def _payload(self) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors import sensor
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 START, HEADER = 0x9A, 4
 READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
@@ -160,10 +160,6 @@ class Robotiq(Sensor):
         """Start packets with all fields of both fingers at ``rate_hz``."""
         yield Ask(command(SYNCHRONOUS, bytes([self.period_ms])))
 
-    def device(self) -> Device:
-        """Return an emulated pair of fingertips that wait for their period or for requests."""
-        return _Fingertips(streaming=False)
-
     @functools.cached_property
     def _keys(self) -> tuple[tuple[int, int], ...]:
         """Kind and finger of each field of a sample, in the order of the protocol."""
@@ -196,37 +192,6 @@ class Robotiq(Sensor):
         if not self.tick_us or "timestamp" not in self.parts:
             return None
         return np.rint(values[-1][:, 0] * (self.tick_us * 1e3)).astype(np.int64)
-
-
-@dataclass
-class _Fingertips(Device):
-    """Emulated fingertips: they report their version, send a packet on request, or stream with a period."""
-
-    requests: int = 0
-    version: bytes = field(default=b"\x01\x00\x00")
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process packets of the host, which set the rate or request packets, and return the replies."""
-        self.heard += data
-        replies = []
-        while (start := self.heard.find(START)) >= 0 and len(self.heard) >= start + HEADER:
-            size = HEADER + self.heard[start + 3]
-            if len(self.heard) < start + size:
-                break
-            message = bytes(self.heard[start : start + size])
-            del self.heard[: start + size]
-            if message[2] in (SYNCHRONOUS, ASYNCHRONOUS) and size == HEADER + 1:
-                self.streaming = message[4] > 0
-                self.rate_hz = 1000 / message[4] if message[4] else None
-            elif message[2] == READ:
-                self.requests += 1
-            elif message[2] == VERSION:
-                replies.append(command(VERSION, self.version))
-        return replies
-
-    def polled(self) -> int:
-        requests, self.requests = self.requests, 0
-        return requests
 
 
 def command(code: int, data: bytes = b"") -> bytes:

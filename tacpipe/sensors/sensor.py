@@ -1,4 +1,4 @@
-"""Define sensors, which decode bytes to samples, provide the requests to a device, and emulate the device.
+"""Define sensors, which decode bytes to samples, encode samples, and provide the requests to a device.
 
 A product is one module with one frozen dataclass, a `Sensor`. Its fields are the options in the rig file, and the comment of
 each is its help text. Sensors do no input or output: links transport the bytes, see `tacpipe.links`.
@@ -7,7 +7,7 @@ each is its help text. Sensors do no input or output: links transport the bytes,
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypedDict
 
 from tacpipe.arrays import AnyArray, Int64s, Times
@@ -66,23 +66,6 @@ class SerialLine:
     dtr: bool | None = None
     rts: bool | None = None
     settle_s: float = 0.0  # time after opening in which the device boots; its bytes are discarded
-
-
-@dataclass
-class Device:
-    """An emulated device. This base class streams from the start and ignores requests."""
-
-    streaming: bool = True
-    rate_hz: float | None = None  # None: the sensor's rate; set by devices that receive their rate
-    heard: bytearray = field(default_factory=bytearray)
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process bytes from the host and return the replies in order."""
-        return []
-
-    def polled(self) -> int:
-        """Return the number of frames requested since the last call; always 0 for a device that streams."""
-        return 0
 
 
 OptionValue = (
@@ -183,10 +166,6 @@ class Sensor:
     def accepts(self, packet: bytes) -> bool:
         """Return whether a packet is recorded. Others are dropped and counted, so that they cannot fill the disk."""
         return True
-
-    def device(self) -> Device:
-        """Return an emulated device."""
-        return Device()
 
 
 def check_positive(sensor: str, **values: float) -> None:

@@ -109,7 +109,8 @@ class Tap(Sensor):
                 if self.grasp == "wrist":
                     record["grasp"]["R"] = np.reshape(row[6:], (3, 3)).T.tolist()
             return [json.dumps(record).encode() for record in records]
-        texts, numbers = samples.values
+        texts, *rest = samples.values
+        numbers = rest[0] if rest else np.zeros((len(samples), 0))
         for record, (event, _), row in zip(records, texts.tolist(), numbers.tolist(), strict=True):
             record |= {"event": event} if event else {}
             for entry, number in zip(self.numbers, row, strict=True):

@@ -19,7 +19,7 @@ from tacpipe.errors import UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc8
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 MARKER = b"\x54"
 SIZE = 4
@@ -70,34 +70,6 @@ class TeraRanger(Sensor):
     def closing(self) -> bytes:
         """Stop the stream."""
         return STOP
-
-    def device(self) -> Device:
-        """Return an emulated sensor that waits for the start command."""
-        return _Evo(streaming=False)
-
-
-class _Evo(Device):
-    """An emulated sensor. It sends frames only in binary mode; text mode is not emulated."""
-
-    binary = False
-    started = False
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Process commands of the host: the stream runs after it was started with binary frames. There are no replies."""
-        self.heard += data
-        while (start := self.heard.find(0x00)) >= 0 and len(self.heard) >= start + 4:
-            size = 4 if self.heard[start + 1] == BINARY[1] else 5
-            if len(self.heard) < start + size:
-                break
-            message = bytes(self.heard[start : start + size])
-            if message not in (BINARY, START, STOP):
-                del self.heard[: start + 1]
-                continue
-            del self.heard[: start + size]
-            self.binary = self.binary or message == BINARY
-            self.started = message == START if message != BINARY else self.started
-            self.streaming = self.binary and self.started
-        return []
 
 
 def _crc_is_right(frames: Bytes) -> Bools:

@@ -33,12 +33,12 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import sum8
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 
 MARKER = b"\x59\x59"
 SIZE = 9
 BITS = 10 * SIZE  # bits per frame on the line, including start and stop bits
-VERSION, RATE, UNIT, ENABLE, SAVE = 0x01, 0x03, 0x05, 0x07, 0x11  # numbers of commands
+RATE, UNIT, ENABLE, SAVE = 0x03, 0x05, 0x07, 0x11  # numbers of commands
 UNITS = {"cm": 1, "mm": 6}
 MODELS = ("original", "s", "plus")
 
@@ -121,40 +121,6 @@ class TfMini(Sensor):
         if self.save:
             yield _request(SAVE)
         yield _request(ENABLE, b"\x01")
-
-    def device(self) -> Device:
-        """Return an emulated sensor that streams from power-on and answers commands."""
-        return Device() if self.model == "original" else _TfMini()
-
-
-class _TfMini(Device):
-    """An emulated sensor, which answers commands with an echo or a status."""
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to commands with the right checksum; other bytes are skipped."""
-        self.heard += data
-        replies = []
-        while (start := self.heard.find(0x5A)) >= 0 and len(self.heard) >= start + 2:
-            size = self.heard[start + 1]
-            if len(self.heard) < start + size:
-                break
-            message = bytes(self.heard[start : start + size])
-            del self.heard[: start + max(size, 1)]
-            if size >= 4 and command(message[2], message[3:-1]) == message:
-                replies += self._replies(message[2], message[3:-1])
-        return replies
-
-    def _replies(self, number: int, payload: bytes) -> list[bytes]:
-        """Return the replies to one command; rate and start change the stream."""
-        if number == VERSION:
-            return [command(VERSION, b"\x01\x02\x03")]
-        if number == SAVE:
-            return [command(SAVE, b"\x00")]
-        if number == RATE:
-            self.rate_hz = float(int.from_bytes(payload, "little")) or None
-        if number == ENABLE:
-            self.streaming = payload == b"\x01"
-        return [command(number, payload)] if number in (RATE, UNIT, ENABLE) else []
 
 
 def command(number: int, payload: bytes = b"") -> bytes:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -21,7 +20,7 @@ from tacpipe.channels import schema
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor
 from tacpipe.signals import kinematics
 
 WIRE = {  # numpy type and number of elements, by RTDE type
@@ -120,7 +119,6 @@ PROTOCOL = 2
 VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvMUOISP"
 KINDS = (VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE)
 STAMP = "timestamp"  # seconds since the controller started
-EMULATED_VERSION = (5, 11, 0, 0)  # version: major, minor, bugfix, build
 MAX_VALUE = 1e12  # upper bound of all outputs: metres, newtons, radians, seconds since the start
 MAX_PACKAGE = 4096  # bytes
 
@@ -239,43 +237,6 @@ class UrRtde(Sensor):
         """Pause the stream."""
         return pack_package(PAUSE)
 
-    def device(self) -> Device:
-        """Return an emulated controller that waits for this sensor's recipe."""
-        return _RtdeController(self)
-
-
-class _RtdeController(Device):
-    """An emulated controller. It supports only the sensor's outputs, in their order."""
-
-    def __init__(self, sensor: UrRtde) -> None:
-        super().__init__(streaming=False)
-        self.outputs = (STAMP, *sensor.outputs)
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to packages: version, controller, recipe of outputs or inputs, start or pause."""
-        self.heard += data
-        replies = []
-        for kind, package in _pop_packages(self.heard):
-            if kind == VERSION:
-                replies.append(pack_package(kind, bytes([package == PROTOCOL.to_bytes(2, "big")])))
-            elif kind == CONTROLLER:
-                replies.append(pack_package(kind, struct.pack(">4I", *EMULATED_VERSION)))
-            elif kind == OUTPUTS:
-                replies.append(self._recipe(package))
-            elif kind == INPUTS:
-                kinds = ",".join(type_of(name) or "NOT_FOUND" for name in package.decode("latin-1").split(","))
-                replies.append(pack_package(kind, b"\1" + kinds.encode()))
-            elif kind in (START, PAUSE):
-                self.streaming = kind == START
-                replies.append(pack_package(kind, b"\1"))
-        return replies
-
-    def _recipe(self, package: bytes) -> bytes:
-        names = tuple(package[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
-        self.rate_hz = float(struct.unpack(">d", package[:8])[0])
-        kinds = ",".join(str(type_of(name)) if name in self.outputs else "NOT_FOUND" for name in names)
-        return pack_package(OUTPUTS, bytes([names == self.outputs]) + kinds.encode())
-
 
 def pack_package(kind: int, payload: bytes = b"") -> bytes:
     r"""Return a package of type ``kind``.
@@ -284,17 +245,6 @@ def pack_package(kind: int, payload: bytes = b"") -> bytes:
     '00 05 56 00 02'
     """
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
-
-
-def _pop_packages(data: bytearray) -> Iterator[tuple[int, bytes]]:
-    """Remove complete packages from the front of ``data`` and yield (type, payload) of each."""
-    while len(data) >= HEADER.size:
-        size, kind = HEADER.unpack_from(data)
-        if len(data) < max(size, HEADER.size):
-            return
-        payload = bytes(data[HEADER.size : size])
-        del data[: max(size, HEADER.size)]
-        yield kind, payload
 
 
 def _ask(kind: int, payload: bytes) -> Ask:

@@ -27,7 +27,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.byte_framer import ByteFramer
 from tacpipe.sensors.checks import crc16_wts
 from tacpipe.sensors.framing import Framer, Framing
-from tacpipe.sensors.sensor import Ask, Device, Dialogue, LocalAddress, Samples, Sensor, grid_fields
+from tacpipe.sensors.sensor import Ask, Dialogue, LocalAddress, Samples, Sensor, grid_fields
 
 MARKER = b"\xaa\xaa\xaa"
 HEADER = 6  # size in bytes: marker, number, size
@@ -153,41 +153,6 @@ class WeissWts(Sensor):
     def taring(self) -> Dialogue:
         """Zero the pressure."""
         yield Ask(message(TARE, b"\x01"), until=_reply_finder(TARE), what="the reply to tare")
-
-    def device(self) -> Device:
-        """Return an emulated sensor with this matrix that waits for the start command."""
-        return _Wts(self)
-
-
-class _Wts(Device):
-    """An emulated sensor, which answers each command with its number and an error code."""
-
-    def __init__(self, sensor: WeissWts) -> None:
-        super().__init__(streaming=False)
-        self.sensor = sensor
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """Return the replies to the complete messages of the host."""
-        self.heard += data
-        replies, stop = [], 0
-        for number, stop, payload in messages(bytes(self.heard)):  # noqa: B007
-            replies.append(message(number, self._execute(number, payload)))
-        del self.heard[:stop]
-        return replies
-
-    def _execute(self, number: int, payload: bytes) -> bytes:
-        """Execute a command and return its reply: a code for success or an unknown command, and the data."""
-        success, unknown = b"\x00\x00", b"\x0e\x00"
-        if number == MATRIX:
-            sizes = (self.sensor.columns, self.sensor.rows, 340, 340, VALUE_MASK)  # cells are 3.4 mm wide, in 1/100 mm
-            return success + b"".join(size.to_bytes(2, "little") for size in sizes)
-        if number == START and len(payload) == 3:
-            self.streaming, self.rate_hz = True, 1000 / max(1, int.from_bytes(payload[1:], "little"))
-        elif number == STOP:
-            self.streaming = False
-        elif number != TARE:
-            return unknown
-        return success
 
 
 def message(number: int, payload: bytes = b"") -> bytes:

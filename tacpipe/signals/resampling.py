@@ -88,6 +88,26 @@ def linear(t_ns: Times, values: AnyArray, grid_ns: Times) -> Floats:
     return step
 
 
+def circular(t_ns: Times, angles: AnyArray, grid_ns: Times, turn: float, bounds: tuple[float, float]) -> Floats:
+    """Return ``angles`` (time, channel) interpolated along the shorter arc at ``grid_ns``, as float64 (grid, channel).
+
+    ``turn`` is a full turn in their unit. A result outside ``bounds``, the smallest and the largest angle, moves by a
+    turn if it is then within them. Raises `TacpipeError` without samples.
+
+    >>> circular(np.array([0, 10]), np.array([[350.0], [20.0]]), np.array([1, 9]), 360.0, (0.0, 359.0)).tolist()
+    [[353.0], [17.0]]
+    """
+    lower, upper, weight = _neighbours(t_ns, grid_ns)
+    start: Floats = angles[lower].astype(np.float64)  # (grid, channel)
+    step = (angles[upper] - start + turn / 2) % turn - turn / 2
+    result: Floats = np.where(angles[upper] == start, start, start + weight[:, None] * step)
+    lowest, highest = bounds
+    for shift in (turn, -turn):
+        moves = ((result < lowest) | (result > highest)) & (result + shift >= lowest) & (result + shift <= highest)
+        result = np.where(moves, result + shift, result)
+    return result
+
+
 def slerp(t_ns: Times, quaternions: Floats, grid_ns: Times) -> Floats:
     """Return ``quaternions`` (time, 4) at ``grid_ns`` (grid, 4), with constant angular speed along the shorter arc.
 

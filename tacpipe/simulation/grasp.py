@@ -23,7 +23,6 @@ import pyarrow as pa
 
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import biotac_sp, schema
-from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import depth_camera, fingertip_sp, pinch
 from tacpipe.simulation.grasp_scene import (
@@ -44,41 +43,25 @@ def draw_readings(
     situation: pinch.Situation,
     hand: fingertip_sp.Sensors,
     rng: np.random.Generator,
-    *,
+    rig: GraspRig,
     draws: int = DRAWS,
-    effort_spread: float = 0.15,
-    noise_scale: float = 1.0,
-    drift_count_day: float = 30.0,
 ) -> Counts:
     """Return possible readings of one situation (draw, finger, channel), with random unobserved values for each draw.
 
     Channels are the electrodes, then the pressure. The times of the drift are random, too.
     """
-    contact = pinch.touch(situation, pinch.draw_unseen(rng, draws, effort_spread))
+    contact = pinch.touch(situation, pinch.draw_unseen(rng, draws, rig.effort_spread))
     counts = fingertip_sp.signal(hand, contact.force_n, contact.contact_m, contact.skin_m, contact.centre_m)
     phases = rng.uniform(0, 2 * np.pi, (draws, *hand.phases_rad.shape))
-    error = fingertip_sp.drift(phases, drift_count_day) + noise_scale * hand.noise * rng.normal(size=counts.shape)
+    error = fingertip_sp.drift(phases, rig.drift_count_day) + rig.noise_scale * hand.noise * rng.normal(
+        size=counts.shape
+    )
     return fingertip_sp.to_counts(counts + error)
 
 
 def mean_and_variance(possible: Counts) -> tuple[Floats, Floats]:
     """Return mean in counts and variance in counts² (finger, channel) of readings (draw, finger, channel)."""
     return possible.mean(axis=0), possible.var(axis=0, ddof=1)
-
-
-def error_bound(
-    hand: fingertip_sp.Sensors, scene: GraspScene, rig: GraspRig, rng: np.random.Generator
-) -> tuple[Floats, Floats]:
-    """Return mean and variance (finger, channel) of the readings given only the geometry."""
-    possible = draw_readings(
-        scene.situation,
-        hand,
-        rng,
-        effort_spread=rig.effort_spread,
-        noise_scale=rig.noise_scale,
-        drift_count_day=rig.drift_count_day,
-    )
-    return mean_and_variance(possible)
 
 
 def truth_table(
@@ -142,10 +125,8 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
     """Simulate trial ``index`` of the rig.
 
     The streams are cloud, grasp, reading and truth; with ``raw``, scene, grasp, biotac_sp, scene_truth and truth. The
-    same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth. Raises
-    `TacpipeError` if the rig is invalid.
+    same seed, index and rig give the same values. Columns of ``truth`` and ``scene_truth`` are ground truth.
     """
-    _check(rig)
     scene = perform(seed, index, rig)
     t_ns = stamp_ns(index, rig)
     hand = sensors(seed)
@@ -164,8 +145,8 @@ def simulate_trial(seed: int, index: int, rig: GraspRig) -> RecordingOutput:
         streams["cloud"] = scene.cloud.table()
         no_drift = np.zeros((1, len(biotac_sp.FINGERS)))
         streams["reading"] = _noisy_stream(np.array([t_ns + READ_NS]), hand, readings.signal[None], no_drift, rig, rng)
-    bound = error_bound(hand, scene, rig, np.random.default_rng([seed, BOUND, index]))
-    streams["truth"] = truth_table(t_ns, scene, readings, bound, moments_ns)
+    possible = draw_readings(scene.situation, hand, np.random.default_rng([seed, BOUND, index]), rig)
+    streams["truth"] = truth_table(t_ns, scene, readings, mean_and_variance(possible), moments_ns)
     return RecordingOutput(streams, _attributes(scene, session(index, rig)))
 
 
@@ -228,16 +209,3 @@ def _attributes(scene: GraspScene, session: int) -> dict[str, Attribute]:
         "family": scene.thing.family,
         "session": f"{scene.thing.name}-s{session:02d}",
     }
-
-
-def _check(rig: GraspRig) -> None:
-    """Raise `TacpipeError` if a value of a rig is out of range, or ``raw`` and ``spheres`` are both set."""
-    if rig.objects < 1:
-        raise TacpipeError(f"objects is {rig.objects}; a family needs 1 or more.")
-    for name in ("effort_spread", "noise_scale", "drift_count_day"):
-        if getattr(rig, name) < 0:
-            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 0 or more.")
-    if not 0 <= rig.shift <= 1:
-        raise TacpipeError(f"shift is {rig.shift}; it must be a fraction between 0 and 1.")
-    if rig.raw and rig.spheres:
-        raise TacpipeError("raw and spheres are both set, but spheres of all sizes have no table. Remove one of them.")

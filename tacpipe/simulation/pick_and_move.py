@@ -56,7 +56,7 @@ FRICTION = (0.35, 0.60)  # mu_s
 RESERVE = 1.3  # minimum 2 mu_s N / (m g): slip starts at 0.3 g or more, and kinetic friction still carries the weight
 OPEN_M, GRASPED_M = 0.070, 0.040  # distance between the fingers, open and around the bottle
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
-HANDLING_STREAM = 3  # part of the random seed of a handling; devices and cameras have other numbers
+HANDLING_STREAM, SKIN_STREAM = 3, 10  # parts of the random seed; devices and cameras have other numbers
 BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
 MEMORY_BYTES = 1 << 24  # streams larger than this are spilled to disk
 PLAN_S, PLAN_POINT_S = 1.0, 0.02  # length of a plan, and the time between its points
@@ -90,6 +90,7 @@ class PickRig:
     clock_offset_ms: float = 80.0
     clock_skew_ppm: float = 50.0
     plan_rate_hz: float = 0.0
+    same_skins: bool = False
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,8 @@ def perform(seed: int, index: int, rig: PickRig = PickRig()) -> PickScene:
         grasp = mechanics.HeldObject(mass_kg, grasp.friction, grasp.grip_n * remaining_grip, rig.lever_m)
     rise_m = None if rig.still else path.rise_m
     contact = mechanics.carry(grasp, path.hand_acceleration_m_s2, rise_m, rate_hz=trajectory.RATE_HZ)
-    skins = (taxels.draw_skin(rng), taxels.draw_skin(rng))
+    skin_rng = np.random.default_rng([seed, SKIN_STREAM]) if rig.same_skins else rng
+    skins = (taxels.draw_skin(skin_rng), taxels.draw_skin(skin_rng))
     finger_m = OPEN_M + (GRASPED_M - OPEN_M) * closing
     scene = PickScene(protocol, path, finger_m, grasp, contact, skins, loss_ns)
     if course is None:

@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import schema
-from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, fingertip, forearm, texture
 
 SENSORS = ("biotac", "roboskin")
-SPECTRA = ("shared", "independent")
+SHARED, INDEPENDENT = SPECTRA = ("shared", "independent")
 START_NS = 1_581_000_000_000_000_000  # UTC time of the first trial
 TRIAL_NS = 60_000_000_000
 FORCE_SPREAD = 0.05  # relative standard deviation of the force between trials
@@ -65,7 +64,7 @@ class SlideRig:
     materials: int = 20
     sessions: int = 1
     identical_materials: bool = False
-    spectra: str = "shared"
+    spectra: str = SHARED
     session_scale: float = 1.0
     noise_scale: float = 1.0
     force_n: float = 1.0
@@ -112,7 +111,7 @@ def slide_trial(index: int, rig: SlideRig) -> SlideTrial:
 
 def material(seed: int, sensor: str, number: int, rig: SlideRig = SlideRig()) -> texture.Material:
     """Return material ``number`` for ``sensor``. It is the same for both sensors if they share their spectra."""
-    source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
+    source = SENSORS.index(sensor) if rig.spectra == INDEPENDENT else 0
     index = 0 if rig.identical_materials else number
     return texture.draw_material(np.random.default_rng([seed, MATERIAL, source, index]))
 
@@ -121,9 +120,8 @@ def simulate_trial(seed: int, index: int, rig: SlideRig = SlideRig()) -> Recordi
     """Simulate trial ``index`` of the rig: the stream biotac or roboskin, truth, and for some BioTac trials the arm.
 
     The same seed, index and rig give the same values. Columns of ``truth``, at the true times of the tactile samples,
-    are ground truth. Raises `TacpipeError` if the rig is invalid.
+    are ground truth.
     """
-    _check(rig)
     scene = perform(seed, index, rig)
     start_ns = START_NS + index * TRIAL_NS
     rng = np.random.default_rng([seed, NOISE, index])
@@ -149,9 +147,8 @@ def perform(seed: int, index: int, rig: SlideRig = SlideRig()) -> SlideScene:
     surface_material = material(seed, trial.sensor, trial.material, rig)
     surface = texture.draw_surface(surface_material, rng)
     force_n = rig.force_n * (1 + FORCE_SPREAD * float(rng.normal()))
-    if trial.sensor == "biotac":
-        return _biotac_scene(trial, surface_material, surface, force_n, rig, rng)
-    return _roboskin_scene(trial, surface_material, surface, force_n, rig, rng)
+    simulate_course = _biotac_course if trial.sensor == "biotac" else _roboskin_course
+    return SlideScene(trial, surface_material, surface, *simulate_course(trial, surface_material, force_n, rig, rng))
 
 
 def response(seed: int, index: int, scene: SlideScene, rig: SlideRig = SlideRig()) -> Floats:
@@ -187,15 +184,10 @@ def nuisance(seed: int, index: int, number: int, rig: SlideRig = SlideRig()) -> 
     return factor, rig.session_scale * (SESSION_N * offset + DRIFT_N * late * drift) + rig.noise_scale * TRIAL_N * noise
 
 
-def _biotac_scene(
-    trial: SlideTrial,
-    surface_material: texture.Material,
-    surface: texture.Waves,
-    force_n: float,
-    rig: SlideRig,
-    rng: np.random.Generator,
-) -> SlideScene:
-    """Return a BioTac slide, which starts with the first sample whose pressure exceeds the trigger."""
+def _biotac_course(
+    trial: SlideTrial, surface_material: texture.Material, force_n: float, rig: SlideRig, rng: np.random.Generator
+) -> tuple[Any, ...]:
+    """Return the arrays of a BioTac slide, which starts with the first sample whose pressure exceeds the trigger."""
     rate_hz = fingertip.RATE_HZ
     touch_s, phase_s = rng.uniform(*HOVER_S), rng.random() / rate_hz
     loading_n_s = surface_material.stiffness_n_m * APPROACH_M_S
@@ -214,10 +206,7 @@ def _biotac_scene(
     sliding_n = (1 - settling) * coming_n[first] + settling * force_n
     pressed_n = np.where(since_s < 0, coming_n[:rows], sliding_n * lifting)
     phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(duration_s * rate_hz), 0, 1))
-    return SlideScene(
-        trial,
-        surface_material,
-        surface,
+    return (
         np.rint(at_s * 1e9).astype(np.int64),
         position_m,
         speed_m_s,
@@ -229,15 +218,10 @@ def _biotac_scene(
     )
 
 
-def _roboskin_scene(
-    trial: SlideTrial,
-    surface_material: texture.Material,
-    surface: texture.Waves,
-    force_n: float,
-    rig: SlideRig,
-    rng: np.random.Generator,
-) -> SlideScene:
-    """Return a RoboSkin slide, which is in contact in all frames, with a varying speed."""
+def _roboskin_course(
+    trial: SlideTrial, surface_material: texture.Material, force_n: float, rig: SlideRig, rng: np.random.Generator
+) -> tuple[Any, ...]:
+    """Return the arrays of a RoboSkin slide, which is in contact in all frames, with a varying speed."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
     variation = float(np.clip(WANDER * rng.normal(), -MAX_WANDER, MAX_WANDER))
     period_s, phase = rng.uniform(*WANDER_S), rng.uniform(0, 2 * np.pi)
@@ -245,10 +229,7 @@ def _roboskin_scene(
     speed = rig.roboskin_speed_m_s * (1 + variation * np.sin(turn * at_s + phase))
     way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
-    return SlideScene(
-        trial,
-        surface_material,
-        surface,
+    return (
         np.rint(at_s * 1e9).astype(np.int64),
         way,
         speed,
@@ -342,14 +323,3 @@ def _attributes(trial: SlideTrial) -> dict[str, Attribute]:
         "rate_hz": fingertip.RATE_HZ if trial.sensor == "biotac" else forearm.RATE_HZ,
         **({"layout": "time"} if trial.sensor == "roboskin" else {}),
     }
-
-
-def _check(rig: SlideRig) -> None:
-    if rig.spectra not in SPECTRA:
-        raise TacpipeError(f"spectra is {rig.spectra!r}; it must be shared or independent.")
-    for name in ("materials", "sessions"):
-        if getattr(rig, name) < 1:
-            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be 1 or more.")
-    for name in ("force_n", "speed_m_s", "roboskin_speed_m_s"):
-        if getattr(rig, name) <= 0:
-            raise TacpipeError(f"{name} is {getattr(rig, name)}; it must be above 0.")

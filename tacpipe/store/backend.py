@@ -80,6 +80,16 @@ class Backend(Protocol):
         """Delete a name; nothing happens if it does not exist."""
 
 
+class ObjectBlocks:
+    """The blocks of an object, which can be iterated repeatedly, each time from a new call of ``read``."""
+
+    def __init__(self, read: Callable[[], Iterator[bytes]]) -> None:
+        self._read = read
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self._read()
+
+
 def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes], T | None]) -> T | None:
     """Return the parsed content of a file, reading it again if the first response cannot be parsed.
 

@@ -8,6 +8,7 @@ last. So the bucket contains everything that its records and names refer to, whe
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -19,10 +20,10 @@ from tacpipe.io.files import Draft, present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
 from tacpipe.store.addresses import BucketAddress
-from tacpipe.store.backend import MAX_CONCURRENT
+from tacpipe.store.backend import MAX_CONCURRENT, ObjectBlocks
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.records import Identity, Provenance, Record, RunProvenance, StoredResult
-from tacpipe.store.remote import RemoteStore
+from tacpipe.store.remote import AnyStore, RemoteStore
 from tacpipe.store.roots import RootProject
 from tacpipe.store.store import AbsentError, MissingError, Object, Store
 
@@ -251,7 +252,7 @@ class CachedStore(Store):
         """Upload objects from the cache. Raises `MissingError` if one is damaged in the cache."""
 
         def send(name: str) -> None:
-            self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
+            self.bucket.files.create(layout.object_name(name), ObjectBlocks(functools.partial(self.read_here, name)))
 
         with self._bar("uploading", len(names)) as advance:
             for name, _ in zip(
@@ -310,12 +311,12 @@ class CachedStore(Store):
         self.prepare()
         return super().commit(identity, result, provenance, replace=True, durable=durable)
 
-    def records(self) -> Iterator[tuple[str, Record]]:
-        """Yield every key and its record, including those of the bucket, which are cached."""
-        keys = [Path(entry.name).stem for entry in self.bucket.files.list("records")]
-        for _, record in self.bucket.records(key for key in keys if not present(self.record_path(key))):
+    def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
+        """Implement `Store.records`, caching the records of the bucket."""
+        in_bucket = self.bucket.names("records") if keys is None else keys
+        for _, record in self.bucket.records(key for key in in_bucket if not present(self.record_path(key))):
             self._keep_record(record)
-        yield from super().records()
+        yield from super().records(keys)
 
     def records_of(self, manifest: str) -> Iterator[tuple[str, Record]]:
         """Implement `Store.records_of` for the cached records."""
@@ -379,15 +380,10 @@ class CachedStore(Store):
         self._upload(absent)
 
 
-class _Blocks:
-    """The verified blocks of a cached object, which can be iterated repeatedly."""
-
-    def __init__(self, store: CachedStore, name: str) -> None:
-        self._store, self._name = store, name
-
-    def __iter__(self) -> Iterator[bytes]:
-        return self._store.read_here(self._name)
-
-
 def _no_bar(note: str = "") -> None:
     """Show nothing."""
+
+
+def bucket_or_folder(store: AnyStore) -> AnyStore:
+    """Return the bucket of a cached store, or another store itself."""
+    return store.bucket if isinstance(store, CachedStore) else store

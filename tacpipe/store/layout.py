@@ -71,6 +71,12 @@ def record_name(key: str) -> str:
     return f"records/{key[:2]}/{key}.json"
 
 
+def belongs(path: str) -> bool:
+    """Return whether a path in a store has the form of its folder's names."""
+    folder, _, name = path.partition("/")
+    return folder in _FORMS and _FORMS[folder].fullmatch(name) is not None
+
+
 def check(root: Path) -> bool:
     """Return True if ``root`` is a store, and False if it is empty or missing, so that a store can be created.
 

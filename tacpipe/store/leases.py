@@ -84,13 +84,8 @@ class Leases:
         handle = _try_lock(path)
         if handle is None:
             handle = _wait(path, work or f"key {key[:12]}", _timeout_s() if timeout_s is None else timeout_s)
-        try:
-            with contextlib.suppress(OSError):  # the note only informs waiting processes
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, note(what=work), 0)
+        with _noted(path, handle, work):
             yield
-        finally:
-            _release(path, handle)
 
     @contextlib.contextmanager
     def running(self, manifests: Iterable[str] = ()) -> Iterator[Announcing]:
@@ -156,12 +151,20 @@ class Leases:
         handle = _try_lock(path)
         if handle is None:
             raise LockedError(f"{_holder(path)} already runs `tacpipe store {work}`. Wait for it.")
-        try:
-            with contextlib.suppress(OSError):
-                os.pwrite(handle, note(what=work), 0)
+        with _noted(path, handle, work):
             yield
-        finally:
-            _release(path, handle)
+
+
+@contextlib.contextmanager
+def _noted(path: Path, handle: int, work: str) -> Iterator[None]:
+    """Describe this process in a lease that it holds, and release the lease after the block."""
+    try:
+        with contextlib.suppress(OSError):  # the note only informs waiting processes
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, note(what=work), 0)
+        yield
+    finally:
+        _release(path, handle)
 
 
 class Announcing:

@@ -19,7 +19,8 @@ import os
 import stat
 import time
 from array import array
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +33,7 @@ from tacpipe.store import layout
 from tacpipe.store.roots import name_of
 from tacpipe.store.store import Store
 
-NOTE_FORMAT = 2
+NOTE_FORMAT = 3
 _HEAD_BYTES = 1 << 20  # maximum length of the first line
 _ROW = 48  # bytes per row: a digest of 32, the size of the object, and its inode
 State = list[int]  # state of a folder: device, inode, and times of change
@@ -57,40 +58,38 @@ class Note:
     """A note as stored."""
 
     head: Head
-    # state, first row, number of rows and their digest, by shelf
-    shelves: Mapping[str, tuple[State | None, int, int, str]]
+    shelves: Mapping[str, State | None]  # states of the folders of objects that the dataset uses
+    rows_digest: str
     file: Path
-    body: int  # offset of the rows in the file
+    offset: int  # position of the rows in the file
 
-    def rows(self, shelf: str) -> list[Row] | None:
-        """Return the noted objects on a shelf, or None if the note is damaged."""
-        content = self.content(shelf)
-        if content is None:
-            return None
-        rows = []
-        for offset in range(0, len(content), _ROW):
-            size, inode = content[offset + 32 : offset + 40], content[offset + 40 : offset + _ROW]
-            rows.append(
-                (content[offset : offset + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little"))
-            )
-        return rows
-
-    def content(self, shelf: str) -> bytes | None:
-        """Return the encoded rows of a shelf, or None if the note is damaged."""
-        _, begin, count, expected_digest = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
-        content = b""
+    @cached_property
+    def rows(self) -> bytes | None:
+        """The encoded rows of all objects, sorted by digest, or None if the note is damaged."""
+        rows = b""
         with contextlib.suppress(OSError, TacpipeError), regular.opened(self.file, follow=False) as reading:
-            reading.seek(self.body + begin * _ROW)
-            content = reading.read(count * _ROW)
-        return content if hashlib.sha256(content).hexdigest() == expected_digest else None
+            reading.seek(self.offset)
+            rows = reading.read()
+        return rows if hashlib.sha256(rows).hexdigest() == self.rows_digest else None
+
+    def objects(self, shelf: str) -> list[Row] | None:
+        """Return the noted objects on a shelf, or None if the note is damaged."""
+        rows = self.rows
+        if rows is None:
+            return None
+        starts, number = range(0, len(rows), _ROW), int(shelf, 16)
+        first, end = (bisect_left(starts, byte, key=lambda start: rows[start]) for byte in (number, number + 1))
+        return [_decode_row(rows[start : start + _ROW]) for start in starts[first:end]]
 
 
-def encode_rows(rows: Iterable[Row]) -> bytes:
-    """Return the encoded rows of objects: digest (32 bytes), size and inode (8 bytes each)."""
-    parts = (
-        bytes.fromhex(name) + size.to_bytes(8, "little") + inode.to_bytes(8, "little") for name, size, inode in rows
-    )
-    return b"".join(parts)
+def _encode_row(row: Row) -> bytes:
+    """Return the encoded row of an object: digest (32 bytes), size and inode (8 bytes each)."""
+    name, size, inode = row
+    return bytes.fromhex(name) + size.to_bytes(8, "little") + inode.to_bytes(8, "little")
+
+
+def _decode_row(row: bytes) -> Row:
+    return row[:32].hex(), int.from_bytes(row[32:40], "little"), int.from_bytes(row[40:], "little")
 
 
 def read_note(store: Store, directory: Path) -> Note | None:
@@ -101,23 +100,18 @@ def read_note(store: Store, directory: Path) -> Note | None:
             first = reading.readline(_HEAD_BYTES)
         head = json.loads(first)
         if head.pop("check") == digest(head) and head.pop("format") == NOTE_FORMAT:
-            shelves = {shelf: tuple(values) for shelf, values in head.pop("shelves").items()}
-            return Note(Head(**head), shelves, file, len(first))
+            return Note(Head(**head.pop("head")), **head, file=file, offset=len(first))
     return None
 
 
-def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple[State | None, bytes]]) -> None:
-    """Write the note on ``directory`` atomically, without syncing it. ``shelves`` has the state and rows of each shelf."""
-    shelf_index, begin = {}, 0
-    for shelf, (state, content) in sorted(shelves.items()):
-        shelf_index[shelf] = state, begin, len(content) // _ROW, hashlib.sha256(content).hexdigest()
-        begin += len(content) // _ROW
-    value = {"format": NOTE_FORMAT, **vars(head), "shelves": shelf_index}
-    head_line = json.dumps({**value, "check": digest(value)}).encode() + b"\n"
+def write_note(store: Store, directory: Path, head: Head, shelves: Mapping[str, State | None], rows: bytes) -> None:
+    """Write the note on ``directory`` atomically, without syncing it. ``rows`` are those of `Note.rows`."""
+    rows_digest = hashlib.sha256(rows).hexdigest()
+    value = {"format": NOTE_FORMAT, "head": vars(head), "shelves": {**shelves}, "rows_digest": rows_digest}
     file, draft = _file(store, directory), Path(store.draft())
     try:
         with open(draft, "xb", opener=create) as writing:
-            writing.writelines([head_line, *(content for _, (_, content) in sorted(shelves.items()))])
+            writing.writelines([json.dumps({**value, "check": digest(value)}).encode() + b"\n", rows])
         make_folder(file.parent)
         if not layout.is_linked(str(store.root), file):
             draft.replace(file)
@@ -131,14 +125,6 @@ def forget_notes(store: Store, names: Iterable[str]) -> None:
     for path in layout.entries(store.root, layout.PRESENCE):
         if path.name not in retained:
             path.unlink(missing_ok=True)
-
-
-def rows_by_shelf(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield each shelf (the first two digits of a digest) with its objects, in order."""
-    shelves: dict[str, list[Row]] = {}
-    for row in rows:
-        shelves.setdefault(row[0][:2], []).append(row)
-    yield from sorted(shelves.items())
 
 
 def _file(store: Store, directory: Path) -> Path:
@@ -195,7 +181,7 @@ class Look:
         if not is_same and _listing_digest(self._directory_state, self.inodes) != head.listing:
             return False
         changed = self._changed_shelves(note)
-        if not all(self._are_intact(note.rows(shelf)) for shelf in changed):
+        if not all(self._are_intact(note.objects(shelf)) for shelf in changed):
             return False
         if not listed and (head.directory != self._directory_state or len(changed) > _MAX_CHANGED):
             self._renew(note, changed)
@@ -216,17 +202,10 @@ class Look:
             settled = self._settled_states()
             if _inodes(self._directory) != inodes or not self._lists_inodes(rows):
                 return False
-            shelves = {
-                shelf: (settled(self._shelves[shelf]), encode_rows(shelf_rows))
-                for shelf, shelf_rows in rows_by_shelf(rows)
-            }
+            shelves = {shelf: settled(self._shelves[shelf]) for shelf in {name[:2] for name, _, _ in rows}}
             listing = _listing_digest(directory_state, inodes)
-            write_note(
-                self._store,
-                self._directory,
-                replace(head, boot=boot, directory=settled(directory_state), listing=listing),
-                shelves,
-            )
+            noted = replace(head, boot=boot, directory=settled(directory_state), listing=listing)
+            write_note(self._store, self._directory, noted, shelves, b"".join(sorted(map(_encode_row, rows))))
             return True
         return False
 
@@ -249,22 +228,20 @@ class Look:
             inodes = _inodes(self._directory)
             if not expected.items() <= inodes.items():
                 return False
-            added = dict(rows_by_shelf({*new_rows, self._object_row(head.manifest)}))
+            if note.rows is None:
+                return False
+            rows = {note.rows[start : start + _ROW] for start in range(0, len(note.rows), _ROW)}
+            new_rows.append(self._object_row(head.manifest))
             settled = self._settled_states()
             shelves = {}
-            for shelf in {*note.shelves, *added}:
-                state, content = self._shelves[shelf], note.content(shelf)
-                if content is None:
-                    return False
-                is_unchanged = shelf in note.shelves and note.shelves[shelf][0] == state
-                shelves[shelf] = (
-                    state if is_unchanged else settled(state),
-                    content + encode_rows(added.get(shelf, ())),
-                )
+            for shelf in {*note.shelves, *(name[:2] for name, _, _ in new_rows)}:
+                state = self._shelves[shelf]
+                is_unchanged = shelf in note.shelves and note.shelves[shelf] == state
+                shelves[shelf] = state if is_unchanged else settled(state)
             listing = _listing_digest(directory_state, inodes)
-            write_note(
-                self._store, self._directory, replace(head, boot=_boot(), directory=None, listing=listing), shelves
-            )
+            noted = replace(head, boot=_boot(), directory=None, listing=listing)
+            rows.update(map(_encode_row, new_rows))
+            write_note(self._store, self._directory, noted, shelves, b"".join(sorted(rows)))
             return True
         return False
 
@@ -277,16 +254,12 @@ class Look:
             gained = sum(state is not None for state in states.values()) > _MAX_CHANGED
             if directory_state == note.head.directory and not gained:
                 return
-            shelves = {}
-            for shelf, (state, *_) in note.shelves.items():
-                content = note.content(shelf)
-                if content is None:
-                    return
-                shelves[shelf] = states.get(shelf, state), content
-            write_note(self._store, self._directory, replace(note.head, directory=directory_state), shelves)
+            if note.rows is not None:
+                noted = replace(note.head, directory=directory_state)
+                write_note(self._store, self._directory, noted, {**note.shelves, **states}, note.rows)
 
     def _changed_shelves(self, note: Note) -> set[str]:
-        return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
+        return {shelf for shelf, state in note.shelves.items() if state is None or state != self._shelves[shelf]}
 
     def _object_row(self, name: str) -> Row:
         """Return digest, size and inode of an object. Raises `KeyError` if it is not a file of the directory."""

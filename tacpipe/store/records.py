@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast, final
 
-from tacpipe.io import regular
-from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import bytes_digest, canonical, digest
-from tacpipe.store import layout
 
 if TYPE_CHECKING:
     from tacpipe.io import Json
     from tacpipe.plugins.stage import Attribute, StoredParams, Values
-    from tacpipe.store.store import Store
 
 _RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest>[0-9a-f]{64})","identity":')
 _parse_at = json.JSONDecoder().raw_decode  # maps a text and a start to the value there and its end
@@ -233,37 +228,13 @@ def _is_sound(record: Record, key: str) -> bool:
 # ---- the objects that it names
 
 
-def complete(store: Store, record: ComputedResult) -> bool:
-    """Announce a record's objects, and return whether the store has all of them in their full size."""
-    store.announce(digests(record["result"]))
-    return all(store.has(content["digest"], content["bytes"]) for content in _objects(record["result"]))
-
-
 def digests(result: StoredResult) -> Iterator[str]:
     """Yield the digests of all shards and files in a record's ``result``, or in a manifest."""
-    return (content["digest"] for content in _objects(result))
+    return (content["digest"] for content in named_objects(result))
 
 
-def find_naming(store: Store, name: str, written_s: float) -> Iterator[Record]:
-    """Yield the records that contain the digest ``name``, starting with those written closest to ``written_s`` (Unix time).
-
-    A record is written just before its result is published, so few records are read.
-    """
-    distance_s = {}
-    with readable_errors(store.root, reading=True):
-        for path in layout.entries(store.root, "records"):
-            with contextlib.suppress(FileNotFoundError):
-                distance_s[path] = abs(path.lstat().st_mtime - written_s)
-    for path in sorted(distance_s, key=lambda path: (distance_s[path], path)):
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(store.root, reading=True):
-            if name.encode() not in regular.content(path, regular.JSON_BYTES, follow=False):
-                continue
-        record = store.record(path.stem)
-        if record is not None:
-            yield record
-
-
-def _objects(result: StoredResult) -> Iterator[Content]:
+def named_objects(result: StoredResult) -> Iterator[Content]:
+    """Yield the digests and sizes of all shards and files in a record's ``result``, or in a manifest."""
     for entry in result["recordings"].values():
         yield from entry["shards"].values()
     yield from result["files"].values()

@@ -33,23 +33,23 @@ from tacpipe.store.records import (
     parse_record,
     record_content,
 )
-from tacpipe.store.remote_roots import RemoteRoots
-from tacpipe.store.store import AbsentError, MissingError, Object, read_limit
+from tacpipe.store.remote_collections import SNAPSHOTS, RemoteCollections
+from tacpipe.store.store import AbsentError, MissingError, Object, Store, read_limit
 
-SNAPSHOTS = "snapshots"  # keys of the records of each manifest, so that a pull reads only these
 _LISTED = 12  # number of single requests that cost as much on S3 as listing 1,000 names
 _PAGE = 1000  # names listed per request
 _TRIES = 10  # attempts to replace a record that others also replace
 
 
-class RemoteStore:
+class RemoteStore(RemoteCollections):
     """A store on a backend such as a bucket, for `push` and `pull`. Thread-safe."""
 
     at_once = MAX_CONCURRENT
+    young_s = 0.0  # runs are announced before they look for an object, so a collection reads no times
 
     def __init__(self, files: Backend) -> None:
-        self.files = files
-        self.roots = RemoteRoots(files)
+        super().__init__(files)
+        self.denied: dict[str, str] = {}  # empty, because credentials allow reading everything or nothing
         self._announced: set[str] = set()
         self._leases: list[str] = []
         self._manifests: list[str] = []
@@ -137,13 +137,13 @@ class RemoteStore:
         self.files.create(name, b"\n".join([header, *(object_name.encode() for object_name in new)]))
         self._announced.update(new, new_keys)
 
-    def runs(self) -> dict[str, tuple[Entry, Run]]:
-        """Return the announcement of each run, with the entry of its file, by file name."""
-        runs = {}
+    def runs(self) -> list[Run]:
+        """Return the announced runs."""
+        runs = []
         for entry in self.files.list("leases"):
             with contextlib.suppress(FileNotFoundError):  # the run has ended
                 content = self.files.read(entry.name, LEASE_BYTES)
-                runs[entry.name] = entry, leases.parse_lease(Path(entry.name), content)
+                runs.append(leases.parse_lease(Path(entry.name), content))
         return runs
 
     def exclusively(self, key: str, work: str) -> contextlib.AbstractContextManager[None]:
@@ -152,10 +152,22 @@ class RemoteStore:
 
     # ---- objects
 
-    def sizes(self, names: Collection[str]) -> dict[str, int]:
+    def entries(self, names: Iterable[str]) -> dict[str, Entry]:
+        """Return size and modification time of the objects that exist."""
+        return self._existing_entries("objects", {layout.object_name(name): name for name in names})
+
+    def sizes(self, names: Iterable[str]) -> dict[str, int]:
         """Return the sizes in bytes of the objects that exist."""
-        entries = self._existing_entries("objects", {layout.object_name(name): name for name in names})
-        return {name: entry.bytes for name, entry in entries.items()}
+        return {name: entry.bytes for name, entry in self.entries(names).items()}
+
+    def names(self, folder: str) -> list[str]:
+        """Return the digests in ``objects`` or ``records``."""
+        named = {entry.name: Path(entry.name).stem for entry in self.files.list(folder)}
+        return [name for path, name in named.items() if layout.belongs(path)]
+
+    def foreign(self) -> list[str]:
+        """Return the sorted names among the objects that are not those of objects."""
+        return sorted(entry.name for entry in self.files.list("objects") if not layout.belongs(entry.name))
 
     def present(self, keys: Iterable[str]) -> set[str]:
         """Return the keys that have a record, valid or damaged."""
@@ -185,11 +197,6 @@ class RemoteStore:
         return entries_by_name | {
             remaining[path]: entry for path, entry in zip(remaining, entries, strict=True) if entry is not None
         }
-
-    def has(self, name: str, size: int | None = None) -> bool:
-        """Return whether an object with this digest (and size in bytes) exists, without reading it."""
-        entry = self.files.stat(layout.object_name(name))
-        return entry is not None and size in (None, entry.bytes)
 
     def put(self, content: bytes, *, durable: bool = True) -> Object:
         """Store ``content`` and return its digest and size. Stored content always survives a power loss."""
@@ -237,6 +244,11 @@ class RemoteStore:
                 f"replaces it."
             )
 
+    def verify(self, name: str) -> None:
+        """Read an object and check its digest. Raises the errors of `read`."""
+        for _ in self.blocks(name):
+            pass
+
     def _stored_blocks(self, name: str, limit: int) -> Iterator[bytes]:
         """Yield the content of an object, including one that a running or killed collection moved aside.
 
@@ -259,16 +271,6 @@ class RemoteStore:
     def quarantine(self, name: str) -> bool:
         """Move a damaged object to quarantine for inspection; return False if it no longer exists."""
         return self.files.move(layout.object_name(name), f"quarantine/{name}.{time.time_ns()}")
-
-    def asides(self, name: str = "") -> Iterator[Entry]:
-        """Yield the entries that collections have moved aside, of one object or of all."""
-        return (entry for entry in self.files.list("tmp") if entry.name.startswith(f"tmp/{layout.ASIDE}{name}"))
-
-    def begins(self, name: str, start: bytes) -> bool:
-        """Return whether an object starts with ``start``, or False if it does not exist. It is not verified."""
-        with contextlib.suppress(FileNotFoundError):
-            return next(iter(self.files.blocks(layout.object_name(name), sys.maxsize))).startswith(start)
-        return False
 
     def room(self) -> int | None:
         """Return None, because the free space is unknown."""
@@ -305,7 +307,27 @@ class RemoteStore:
 
     def record(self, key: str) -> Record | None:
         """Return the record of ``key``, or None if there is none or it is damaged."""
-        return self._record(key)[1]
+        try:
+            return self.read_record(key)
+        except MissingError:
+            return None
+
+    def read_record(self, key: str) -> Record:
+        """Return the record of ``key``. Raises `AbsentError` if there is none, and `MissingError` if it is damaged."""
+
+        def parse(content: bytes) -> Record | None:
+            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                regular.expect_parsed(key, len(content))
+                return parse_record(content, key)
+            return None
+
+        try:
+            record = read_twice(self.files, layout.record_name(key), regular.JSON_BYTES, parse)
+        except FileNotFoundError:
+            raise AbsentError(f"Record {key[:12]} is not in the store {self.place}.") from None
+        if record is None:
+            raise MissingError(f"Record {key[:12]} in {self.place} is damaged.")
+        return record
 
     def note_records(self, manifest: str, keys: Collection[str]) -> None:
         """Note which records belong to a manifest."""
@@ -331,23 +353,12 @@ class RemoteStore:
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
         """Yield keys and their records, by default all. Damaged records are skipped."""
-        all_keys = (Path(entry.name).stem for entry in self.files.list("records")) if keys is None else keys
-        for key, record in threads.map_in_threads(self._record, list(all_keys), MAX_CONCURRENT):
-            if record is not None:
-                yield key, record
+        requested = list(self.names("records") if keys is None else keys)
+        found = threads.map_in_threads(self.record, requested, MAX_CONCURRENT)
+        return ((key, record) for key, record in zip(requested, found, strict=True) if record is not None)
 
-    def _record(self, key: str) -> tuple[str, Record | None]:
-        """Return ``key`` with its record, or with None if it is missing or damaged."""
 
-        def parse(content: bytes) -> Record | None:
-            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
-                regular.expect_parsed(key, len(content))
-                return parse_record(content, key)
-            return None
-
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError):
-            return key, read_twice(self.files, layout.record_name(key), regular.JSON_BYTES, parse)
-        return key, None
+AnyStore = Store | RemoteStore
 
 
 def _parse_format(content: bytes) -> str | None:

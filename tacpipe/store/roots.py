@@ -7,16 +7,13 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict, TypeGuard
+from typing import Any, NotRequired, Protocol, TypedDict, TypeGuard
 
 from tacpipe.errors import DeniedError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, digest
 from tacpipe.store.layout import BESIDE_NAME
-
-if TYPE_CHECKING:
-    from tacpipe.store.store import Store
 
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 ROOT_BYTES = 1 << 24  # maximum size of a root, which is enough for a history of 100,000 entries
@@ -60,10 +57,36 @@ class Root(WrittenManifest):
     number: NotRequired[int]  # version of the file in a store without locks; it is not stored
 
 
+class RootFiles(Protocol):
+    """The files of a store, which is a `tacpipe.store.store.Store`, as its roots read and write them."""
+
+    root: Path
+
+    def listed(self, *patterns: str) -> list[Path]:
+        """Return the paths that match one pattern per folder level."""
+        ...
+
+    def note_denied(self, name: str, error: DeniedError) -> None:
+        """Note that this user may not read a file of the store."""
+        ...
+
+    def quarantine(self, path: str | Path) -> bool:
+        """Move a damaged file to quarantine."""
+        ...
+
+    def sync(self, path: str | Path) -> None:
+        """Make the name of a file in the store survive a power loss."""
+        ...
+
+    def write_file(self, path: Path | str, content: bytes) -> bool:
+        """Write a file."""
+        ...
+
+
 class Roots:
     """The roots of a store."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: RootFiles) -> None:
         self.store = store
 
     def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False, key: str = "") -> None:

@@ -19,15 +19,18 @@ from tacpipe.io import files, memory, regular, terminal
 from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store import layout
-from tacpipe.store.backend import Directory
-from tacpipe.store.leases import Announcing, Leases
+from tacpipe.store.backend import Directory, Entry
+from tacpipe.store.leases import Announcing, Leases, Run
 from tacpipe.store.records import (
+    ComputedResult,
     Content,
     Identity,
     Provenance,
     Record,
     RunProvenance,
     StoredResult,
+    digests,
+    named_objects,
     parse_record,
     record_content,
 )
@@ -70,7 +73,8 @@ class Store:
     run.
     """
 
-    at_once = 1  # number of objects that a transfer reads or writes concurrently
+    at_once = 1  # number of objects that are read or written concurrently
+    young_s = 60.0  # age in seconds below which a collection touches no file
     distant = False  # whether this is the local cache of a remote store
 
     def __init__(self, root: Path | str, run: str = "") -> None:
@@ -158,6 +162,10 @@ class Store:
     def run(self) -> str:
         """The lease of the active run, for the processes that work for it; empty if there is none."""
         return "" if self._run is None else self._run.path
+
+    def runs(self) -> list[Run]:
+        """Return the active runs, as `Leases.runs` does."""
+        return self.leases.runs()
 
     def announce(self, names: Iterable[str]) -> None:
         """Announce objects to `gc`. An object must be announced before it is reused or its existence is checked."""
@@ -306,6 +314,12 @@ class Store:
         if hashed.hexdigest() != name:
             raise self._damaged_error(name)
 
+    def verify(self, name: str) -> None:
+        """Read an object and check its digest. Raises the errors of `read`."""
+        if regular.small_file_digest(self.object_path(name)) != name:
+            for _ in self.blocks(name):
+                pass
+
     def _unreadable(self, name: str, error: DeniedError) -> UnreadableError:
         """Note that this user may not read an object or record, and return the error about it."""
         self.note_denied(name, error)
@@ -340,10 +354,6 @@ class Store:
             return False
         return True
 
-    def quarantined(self, name: str) -> bool:
-        """Return whether an object with this digest is in quarantine and has not been recomputed."""
-        return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
-
     def aside_path(self, name: str) -> str:
         """Return the path of an object that a collection moved aside between its first and its second check."""
         return f"{self._root}/tmp/{layout.ASIDE}{name}"
@@ -362,6 +372,32 @@ class Store:
                 if present(self.aside_path(name)):
                     raise
             return False
+
+    @contextlib.contextmanager
+    def collecting(self, grace_days: float, *, dry_run: bool) -> Iterator[None]:
+        """Run the only collection in the block, after putting back the objects that a killed one moved aside.
+
+        A dry run needs neither. Raises `LockedError` if another collection runs.
+        """
+        with contextlib.nullcontext() if dry_run else self.leases.exclusive("gc"), readable_errors(self.root):
+            for path in () if dry_run else layout.entries(self.root, "tmp"):
+                if path.name.startswith(layout.ASIDE) and self.has(path.name.removeprefix(layout.ASIDE)):
+                    path.unlink(missing_ok=True)
+            yield
+
+    def set_aside(self, names: Iterable[str]) -> list[str]:
+        """Move objects aside, and return those that existed. A process that needs one puts it back."""
+        return [name for name in names if self.files.move(layout.object_name(name), f"tmp/{layout.ASIDE}{name}")]
+
+    def put_back(self, names: Iterable[str]) -> None:
+        """Put back objects that were moved aside."""
+        for name in names:
+            self.has(name)
+
+    def discard(self, names: Iterable[str]) -> None:
+        """Remove objects that were moved aside."""
+        for name in names:
+            self.files.delete(f"tmp/{layout.ASIDE}{name}")
 
     def sync(self, path: str | Path) -> None:
         """Make the name of a file in the store survive a power loss, as its content does."""
@@ -396,6 +432,23 @@ class Store:
         """Yield the sorted digests in ``objects`` or ``records``. Raises the errors of `layout.names`."""
         return layout.names(self.root, folder, self.note_denied)
 
+    def foreign(self) -> list[str]:
+        """Return the sorted relative paths in the folder that do not belong to the store."""
+        return layout.foreign(self.root)
+
+    def entries(self, names: Iterable[str]) -> dict[str, Entry]:
+        """Return size and modification time of the objects that exist, without those that this user may not read."""
+        entries = {}
+        for name in names:
+            try:
+                entry = self.files.stat(layout.object_name(name))
+            except DeniedError as error:
+                self.note_denied(name, error)
+                continue
+            if entry is not None:
+                entries[name] = entry
+        return entries
+
     # ---- records
 
     def record(self, key: str) -> Record | None:
@@ -407,6 +460,32 @@ class Store:
             return self.read_record(key)
         except MissingError:
             return None
+
+    def is_complete(self, record: ComputedResult) -> bool:
+        """Announce a record's objects, and return whether the store has all of them in their full size."""
+        self.announce(digests(record["result"]))
+        return all(self.has(content["digest"], content["bytes"]) for content in named_objects(record["result"]))
+
+    def find_naming(self, name: str, written_s: float) -> Iterator[Record]:
+        """Yield the records that contain the digest ``name``, starting with those written closest to ``written_s`` (Unix s).
+
+        A record is written just before its result is published, so few records are read.
+        """
+        distance_s = {}
+        with readable_errors(self.root, reading=True):
+            for path in layout.entries(self.root, "records"):
+                with contextlib.suppress(FileNotFoundError):
+                    distance_s[path] = abs(path.lstat().st_mtime - written_s)
+        for path in sorted(distance_s, key=lambda path: (distance_s[path], path)):
+            with (
+                contextlib.suppress(FileNotFoundError, regular.IrregularError),
+                readable_errors(self.root, reading=True),
+            ):
+                if name.encode() not in regular.content(path, regular.JSON_BYTES, follow=False):
+                    continue
+            record = self.record(path.stem)
+            if record is not None:
+                yield record
 
     def read_record(self, key: str) -> Record:
         """Return the record of ``key``.
@@ -472,9 +551,9 @@ class Store:
         """Yield records with their keys that include all records of a manifest: those of the whole store."""
         return self.records()
 
-    def records(self) -> Iterator[tuple[str, Record]]:
-        """Yield every key and its record."""
-        for key in self.names("records"):
+    def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, Record]]:
+        """Yield keys and their records, by default all. Damaged records are skipped."""
+        for key in self.names("records") if keys is None else keys:
             record = self.record(key)
             if record is not None:
                 yield key, record

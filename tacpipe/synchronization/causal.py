@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,11 @@ from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
 from tacpipe.signals.repairs import RANGE, count_wraps
 from tacpipe.signals.resampling import is_overdue, median_before, newest_known_rows, uniform_offsets
 from tacpipe.signals.sampling import PlacedSamples
+from tacpipe.synchronization import streams
 from tacpipe.synchronization.columns import ONLINE_MEDIAN_NS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 INITIAL_ROWS = 256  # initial size of a buffer
 # Samples are kept for this time while the master is silent. After a longer silence, its samples are at their arrivals.
@@ -32,6 +36,32 @@ class StreamColumns:
     wraps: Sequence[int] = ()  # columns with 16-bit counts to unwrap
     medians: Sequence[int] = ()  # columns that are filtered with a median
     compared: Sequence[int] = ()  # columns that are compared to detect repeated samples
+
+    @classmethod
+    def from_schema(cls, schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
+        """Return the columns ``names`` of a stream, for the params of the stage ``synchronize``.
+
+        If the stream's repeated samples matter, all its channels are added to ``names``.
+        """
+        import pyarrow as pa
+
+        compared: list[int] = []
+        if is_master and synchronize.grid == "fresh":
+            compared_names = [
+                name for name in streams.channel_names(schema) if streams.method(schema, name) != "nearest"
+            ]
+            names += [name for name in compared_names if name not in names]
+            compared = [names.index(name) for name in compared_names]
+        wraps = [
+            index
+            for index, name in enumerate(names)
+            if synchronize.unwrap
+            and (schema.field(name).metadata or {}).get(b"quantity") == b"tactile"
+            and pa.types.is_integer(schema.field(name).type)
+            and schema.field(name).type.bit_width == 16
+        ]
+        medians = [index for index, name in enumerate(names) if streams.method(schema, name) == "median"]
+        return cls(len(names), wraps, medians, compared)
 
 
 class GridRows(NamedTuple):
@@ -123,8 +153,8 @@ class Grid:
                 newest_ns[name][has_samples], values[name][has_samples] = source.at(newest[name][has_samples], at_ns)
                 gap[name][has_samples] = is_overdue(newest_ns[name][has_samples], at_ns, self._gap_ns[name])
         needed_ns = until_ns
-        if self._rate_hz is None and (sampled_ns := self._sources[self._master].newest_ns) is not None:
-            needed_ns = max(min(until_ns, sampled_ns), until_ns - HISTORY_NS)
+        if self._rate_hz is None:  # the next row may have been measured long before it arrives
+            needed_ns = max(min(until_ns, self._sources[self._master].taken_ns), until_ns - HISTORY_NS)
         for source in self._sources.values():
             source.forget(until_ns, needed_ns)
         return GridRows(t_ns, arrival_ns, at_arrival, has_samples, newest_ns, gap, values)
@@ -155,7 +185,7 @@ class _Source:
     def __init__(self, reading: StreamColumns) -> None:
         self.reading = reading
         self.first_arrival_ns: int | None = None
-        self.newest_ns: int | None = None  # sampling time of the newest sample
+        self.taken_ns = 0  # sampling time of the newest sample that was taken as a row
         self._wraps, self._compared, self._medians = (
             np.array(columns, np.intp) for columns in (reading.wraps, reading.compared, reading.medians)
         )
@@ -189,7 +219,6 @@ class _Source:
                 self._repeated[self._stop] = False
         self._before = values[-1].copy()
         self._stop += len(t_ns)
-        self.newest_ns = int(t_ns[-1])
         self.first_arrival_ns = int(arrival_ns[0]) if self.first_arrival_ns is None else self.first_arrival_ns
 
     def take_rows(self, until_ns: int, *, fresh: bool) -> tuple[Times, Times, Bools]:
@@ -197,6 +226,7 @@ class _Source:
         first = self._next_row
         self._next_row += int(np.searchsorted(self._arrival_ns[first : self._stop], until_ns, side="right"))
         rows = np.arange(first, self._next_row)
+        self.taken_ns = int(self._t_ns[rows[-1]]) if len(rows) else self.taken_ns
         rows = rows[~self._repeated[rows]] if fresh else rows
         return self._t_ns[rows], self._arrival_ns[rows], self._at_arrival[rows]
 

@@ -31,6 +31,11 @@ def are_arrivals(field: pa.Field, attributes: Mapping[str, Attribute], equal_fra
     return has_arrivals(field) or ENDED in attributes or equal_fraction > BURST_FRACTION
 
 
+def equal_fraction(table: pa.Table) -> float:
+    """Return the fraction of stamps of a stream that equal the previous one."""
+    return float((np.diff(table.column("t_ns").to_numpy()) == 0).sum() / table.num_rows)
+
+
 class Placement:
     """Places the samples of one stream, batch by batch. The results do not depend on the batches."""
 

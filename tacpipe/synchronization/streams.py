@@ -12,6 +12,7 @@ import pyarrow as pa
 from tacpipe import printable
 from tacpipe.arrays import AnyArray, Bools, Indices, Int32s, Int64s, Times, from_arrow, is_numeric, to_arrow
 from tacpipe.channels import arm
+from tacpipe.channels.schema import TRUTH
 from tacpipe.channels.streams import layout_entry, missing_channel_error
 from tacpipe.errors import TacpipeError
 from tacpipe.io.columns import Columns, SelectedRows
@@ -26,7 +27,6 @@ from tacpipe.synchronization.placement import Placement, are_arrivals
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
-TRUTH = "gt_"  # prefix of ground-truth columns; their names are unchanged and they have no masks
 DEVICE, SEQUENCE = "t_device_ns", "seq"  # device time and sequence number of a sample; never interpolated
 # column of the recorder with the maximum delay of each arrival time; not a channel
 UNCERTAIN = "t_uncertain_ns"
@@ -124,11 +124,17 @@ class TimedStream:
     attributes: dict[str, Attribute] = field(default_factory=dict)  # results of the clock fit
     wraps: Mapping[str, Wraps] = field(default_factory=dict)  # channels whose counts are unwrapped
     first_row: int = 0  # number of samples of the stream before these samples
+    excluded: frozenset[str] = frozenset()  # channels that are not read, because they are measured truth
 
     @property
     def channels(self) -> list[str]:
         """The names of its channels."""
-        return channel_names(self.columns.schema)
+        return [name for name in channel_names(self.columns.schema) if name not in self.excluded]
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The fields of the time and of its channels."""
+        return pa.schema([kind for kind in self.columns.schema if kind.name not in self.excluded])
 
     def field(self, name: str) -> pa.Field:
         """Return the field of a channel. An unwrapped channel has the type after unwrapping."""

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.datasets.selection import chain_difference
+from tacpipe.engine import by_recording
 from tacpipe.errors import UsageError
+from tacpipe.plugins import params, registry
 from tacpipe.store.records import Step
 
 
@@ -42,7 +44,6 @@ def open_for_model(recordings: Dataset | Recording, chain: OpenedChain | None) -
     if chain is None or list(dataset.source.chain) == list(chain.steps):
         return dataset
     _check_stages(chain.steps, dataset)
-    from tacpipe.engine import by_recording
 
     return by_recording.run_chain_of_model(dataset, chain.model)
 
@@ -65,8 +66,6 @@ def _check_stages(expected: Sequence[Step], recordings: Dataset) -> None:
 
 def _command(step: Step) -> str:
     """Return the command of a step of a chain, with the params that differ from their defaults."""
-    from tacpipe.plugins import params, registry
-
     default_values = params.to_input(params.from_json(registry.load(step["stage"]), {}))
     words = [step["stage"].replace(".", " ")]
     for name, value in params.with_current_names(step["stage"], step["params"]).items():

@@ -14,51 +14,28 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io import Scalar
-from tacpipe.plugins.stage import AnyStage, Requirements, Result
+from tacpipe.plugins import registry
+from tacpipe.plugins.model import CalibrationRequest as CalibrationRequest
+from tacpipe.plugins.model import Files as Files
+from tacpipe.plugins.model import LoadedModel as LoadedModel
+from tacpipe.plugins.model import ModelConfig as ModelConfig
+from tacpipe.plugins.model import PredictionRequest as PredictionRequest
+from tacpipe.plugins.requirements import Requirements
+from tacpipe.plugins.stage import AnyStage, Result
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.clouds.cloud import Cloud
     from tacpipe.clouds.grasp import Grasp
-    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
+    from tacpipe.report.context import TaskReport
     from tacpipe.tasks.recordings import OpenedChain
 
-Files = Mapping[str, bytes]  # model files by name
 GraspPredictor = Callable[[Any, "Cloud", "Grasp"], dict[str, float]]
-
-
-class ModelConfig(TypedDict):
-    """Fields of ``config.json`` that are common to the models of all tasks."""
-
-    task: str
-    architecture: str
-    params: dict[str, Scalar]  # stored by `tacpipe.plugins.params`
-    trained_on: dict[str, str]  # recording name -> digest
-
-
-class LoadedModel(Protocol):
-    """A model in memory, as returned by `tacpipe.load`."""
-
-    @property
-    def predict(self) -> Callable[..., Any]:
-        """Function that takes a dataset or a recording and returns the table of ``tacpipe predict``."""
-        ...
-
-
-@dataclass(frozen=True)
-class PredictionRequest:
-    """Options of a prediction."""
-
-    steps: Sequence[int]  # steps ahead, ascending, for tasks that predict the future
-    quantiles: Sequence[int] = ()  # quantile levels in percent, ascending
-    probabilities: bool = False  # True to add calibrated probabilities
-    allow_look_ahead: bool = False  # for causal predictions: accept a model that was trained on rows with look-ahead
 
 
 @dataclass(frozen=True)
@@ -76,9 +53,9 @@ class Demo(NamedTuple):
 
     commands: list[list[str]]  # commands in order, without the leading ``tacpipe``
     results: list[str]  # paths of the results on the page
-    datasets: Sequence[str] = ()  # paths of datasets on the page that are not results
     # commands from the emulated rig's ``recordings`` below the output to ``results``; empty if there are none
     recorded: Sequence[list[str]] = ()
+    simulated: Sequence[str] = ()  # the simulation, without its output, whose recordings the emulated rig replays
     shortened: Sequence[str] = ()  # models that are trained for a fraction of their schedule, each with that fraction
 
 
@@ -86,20 +63,17 @@ class Task(ABC):
     """A task. Abstract members are required; each property that a subclass does not override is an absent capability."""
 
     name: ClassVar[str]  # name of the entry point
-    # A stage whose function is in the module of the subclass. Its signature, params, version and requirements are those
-    # of ``tacpipe train NAME``. Its result contains ``config.json`` with ``task``, which is `name`, and ``trained_on``,
-    # the digests by name of the training recordings.
+    # streams, quantities and labels that recordings must have; None if the task does not declare them
+    requirements: ClassVar[Requirements | None] = None
+    # A stage whose function is in the module of the subclass. Its signature, params and version are those of ``tacpipe
+    # train NAME``. Its result contains ``config.json`` with ``task``, which is `name`, and ``trained_on``, the digests by
+    # name of the training recordings.
     train: ClassVar[AnyStage]
 
     @property
     def params(self) -> Any:
         """Dataclass of the options of ``tacpipe train``, or a union with one dataclass per architecture."""
         return self.train.params
-
-    @property
-    def requirements(self) -> Requirements | None:
-        """Streams, quantities and labels that recordings must have; None if the task does not declare them."""
-        return self.train.requirements
 
     @abstractmethod
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
@@ -146,14 +120,15 @@ class Task(ABC):
         return None
 
 
-@dataclass(frozen=True)
-class CalibrationRequest:
-    """Options of the calibration of a trained model."""
+def task_of_model(files: Files, place: str = "This") -> Task:
+    """Return the task of the model among ``files``.
 
-    quantiles: tuple[int, ...]  # quantile levels in percent, ascending
-    promise: bool  # True if bands must have at least their nominal coverage in a new recording
-    false_unknown: float  # allowed fraction of slides of learned classes that are classified as unknown
-    seed: int
+    Raises `UsageError`, which names ``place``, if there is no model, `TacpipeError` if it is invalid.
+    """
+    from tacpipe.datasets import model_files
+
+    task: Task = registry.load_task(model_files.task_name(files, place))
+    return task
 
 
 class Levelled(Protocol):

@@ -65,7 +65,33 @@ def curves_of_table(stream: str, table: pa.Table) -> list[Curves]:
             curves.append(Curves(stream, quantity, unit, (name,), *unroll_readings(t_ns, values)))
         else:
             curves.append(Curves(stream, quantity, unit, short_names(fields), t_ns, values))
-    return curves
+    return [*curves, *_forecast_curves(stream, table)]
+
+
+def _forecast_curves(stream: str, table: pa.Table) -> list[Curves]:
+    """Return the channel that varies most with its forecasts, at the times that they are for; empty without forecasts.
+
+    A forecast of ``step`` rows ahead stands ``step`` rows after the row that it was made at; the first rows have none.
+    """
+    steps: dict[str, list[tuple[int, str]]] = {}
+    for field in table.schema:
+        step, channel = int(field_metadata(field).get("step", "0")), field.name.rpartition("_t")[0]
+        if step and channel in table.column_names and step < table.num_rows:
+            steps.setdefault(channel, []).append((step, field.name))
+    if not steps:
+        return []
+    spread = {channel: np.ptp(values[np.isfinite(values)]) for channel in steps
+              if np.isfinite(values := matrix(table, [channel])[:, 0]).any()}  # fmt: skip
+    channel = max(spread, key=lambda name: float(spread[name]), default=next(iter(steps)))
+    values = matrix(table, [channel, *(name for _, name in sorted(steps[channel]))])
+    for column, (step, _) in enumerate(sorted(steps[channel]), start=1):
+        values[step:, column], values[:step, column] = values[:-step, column].copy(), np.nan
+    names = (
+        "measured",
+        *(f"forecast {step} {'row' if step == 1 else 'rows'} ahead" for step, _ in sorted(steps[channel])),
+    )
+    unit = field_metadata(table.schema.field(channel)).get("unit", "")
+    return [Curves(stream, channel, unit, names, table.column(TIME).to_numpy(), values)]
 
 
 def matrix(table: pa.Table, names: Sequence[str]) -> Floats:

@@ -19,8 +19,8 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json, Scalar, terminal
 from tacpipe.io.credentials import refuse_credentials, without_credentials
 from tacpipe.io.hashing import digest
-from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
+from tacpipe.scores import headline
 from tacpipe.store.location import locate
 from tacpipe.store.store import Store
 from tacpipe.training.following import Line, NetworkLabels, TrainedNetwork, read_history

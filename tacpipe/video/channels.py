@@ -40,7 +40,7 @@ class FrameChannels(Protocol):
 
 
 class DifferenceChannels:
-    """The mean brightness of each cell of a grid and colour, minus that of the first frames.
+    """The mean brightness of each cell of a grid and colour, minus that of the first frames if there are any.
 
     ``place`` names the stream in errors.
     """
@@ -49,6 +49,7 @@ class DifferenceChannels:
 
     def __init__(self, rows: int, columns: int, reference_frames: int, place: str) -> None:
         self._rows, self._columns, self._left, self._place = rows, columns, reference_frames, place
+        self._has_reference = reference_frames > 0
         self._reference_sum, self._reference_count = np.zeros((rows, columns, len(COLOURS))), 0
 
     def fields(self) -> list[pa.Field]:
@@ -63,8 +64,10 @@ class DifferenceChannels:
         ]
 
     def values(self, image: Bytes) -> AnyFloats:
-        """Return the brightness differences of the next frame from the mean of the first frames, flat (cell and colour,)."""
+        """Return the brightness of the next frame, less the mean of the first frames, flat (cell and colour,)."""
         means = cell_means(image, self._rows, self._columns)
+        if not self._has_reference:
+            return means.ravel()
         if self._left:
             self._reference_sum, self._reference_count = self._reference_sum + means, self._reference_count + 1
             self._left -= 1
@@ -73,7 +76,7 @@ class DifferenceChannels:
     def skip(self) -> None:
         """Leave out the next frame. Raises `TacpipeError` if all frames that show the untouched gel are damaged."""
         self._left = max(0, self._left - 1)
-        if not self._left and not self._reference_count:
+        if self._has_reference and not self._left and not self._reference_count:
             raise TacpipeError(
                 f"{self._place}: all frames that show the untouched gel are damaged. Give more with --reference-frames, or "
                 f"leave the recording out with --skip-bad."

@@ -128,6 +128,18 @@ def raw_images(images: AnyArray) -> list[bytes]:
     return [np.ascontiguousarray(image).tobytes() for image in images]
 
 
+_STARTS = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # image formats by their first bytes
+
+
+def picture_encoding(content: bytes) -> str:
+    r"""Return the encoding of a picture by its first bytes, or an empty string if it is none of JPEG, PNG and WebP.
+
+    >>> picture_encoding(b"\xff\xd8\xff\xe0"), picture_encoding(b"abc")
+    ('jpeg', '')
+    """
+    return next((name for start, name in _STARTS.items() if content.startswith(start)), "")
+
+
 def image_format(image: bytes) -> VideoFormat | None:
     """Return the format of an encoded image, or None for bytes that are not a JPEG or PNG image."""
     shape = read_shape(image)

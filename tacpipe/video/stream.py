@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.channels.schema import DAMAGED
+from tacpipe.channels.schema import DAMAGED, device_fields, time_field
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals.runs import runs
@@ -121,8 +121,6 @@ class VideoFormat:
         ``stamp_origin`` is the origin of timestamps that do not come from a clock.
         """
         import pyarrow as pa
-
-        from tacpipe.channels.schema import device_fields, time_field
 
         counter = device_fields(clock=False, counters=["seq"]) if counted else []
         return pa.schema([time_field(stamp_origin), *counter, *self.fields()])

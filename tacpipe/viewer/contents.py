@@ -11,13 +11,12 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bytes, Float32s, Floats, Times
-from tacpipe.channels.schema import field_metadata
-from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
+from tacpipe.channels.schema import TRUTH, field_metadata
+from tacpipe.channels.streams import COUNT, EVENTS, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.dataset import Recording
 from tacpipe.datasets.intervals import all_intervals
 from tacpipe.datasets.overview import split_tables
-from tacpipe.formats.arrays.tree import picture_encoding
 from tacpipe.io.columns import Columns
 from tacpipe.plugins.stage import Attribute, ParamValue
 from tacpipe.printable import plain
@@ -30,6 +29,7 @@ from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
 from tacpipe.video.decoding import jpeg_images, read_frames
+from tacpipe.video.images import picture_encoding
 from tacpipe.video.stream import BATCH_ROWS, PACKET, read_format
 from tacpipe.viewer.markers import MarkerTrack, track_markers
 

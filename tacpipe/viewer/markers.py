@@ -13,6 +13,9 @@ from tacpipe.channels.schema import field_metadata
 from tacpipe.datasets.dataset import Recording
 from tacpipe.store.records import Step
 from tacpipe.traces.curves import TIME
+from tacpipe.video.decoding import read_frames
+from tacpipe.video.markers import find_grid
+from tacpipe.video.stream import read_format
 
 STAGE = "extract.markers"
 AXES = ("x", "y")
@@ -36,10 +39,6 @@ def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequenc
     is found. The markers at rest are found in the first frame, as in `extract markers`. Raises `TacpipeError` if the
     frame cannot be decoded.
     """
-    from tacpipe.video.decoding import read_frames
-    from tacpipe.video.markers import find_grid
-    from tacpipe.video.stream import read_format
-
     names_by_position = _names_by_position(table)
     if not names_by_position or TIME not in table.column_names or stream not in video.streams:
         return None

@@ -7,7 +7,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
-from tacpipe.metrics.pairing import Measure
+from tacpipe.scores.pairing import Measure
 
 QUESTION = Question("known")
 

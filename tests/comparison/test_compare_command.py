@@ -14,9 +14,9 @@ import pytest
 from tacpipe.cli import compare
 from tacpipe.cli.compare import Compared
 from tacpipe.comparison import engine, runs
-from tacpipe.comparison.runs import ComparedRun, Question, report_on
+from tacpipe.comparison.runs import ComparedRun, Question, TaskResults
 from tacpipe.engine import pipeline
-from tacpipe.metrics import headline
+from tacpipe.scores import headline
 from tests import older
 from tests.comparison.comparison_fakes import run
 from tests.conftest import Ran
@@ -34,13 +34,13 @@ def weigh(errors: list[float], path: str, data: str = "d" * 64, **about: Any) ->
 
 
 def compared(*named_results: tuple[str, ComparedRun], pool: bool = True) -> Compared:
-    task, all_runs = report_on("weighing"), [result for _, result in named_results]
+    task, all_runs = TaskResults("weighing"), [result for _, result in named_results]
     methods = runs.grouped(all_runs) if pool else runs.separate(all_runs)
     return Compared({path: result.dataset for path, result in named_results}, engine.comparisons(task, methods), pool)
 
 
 def lines(comparison: Compared, width: int = 120) -> list[list[str]]:
-    (table,) = comparison.tables()
+    ((_, table),) = comparison.tables()
     return [line.split() for line in table.text(width).splitlines()]
 
 
@@ -54,17 +54,18 @@ WIDTHS = (
 def test_settings_that_differ_are_columns_and_others_are_not_and_the_best_is_first() -> None:
     head, part, first, second, baseline, *_ = lines(compared(*WIDTHS))
 
-    assert head == ["width", "error", "skill", "95", "%", "interval", "n", "runs"]
+    assert head == ["width", "error", "less", "error", "95", "%", "interval", "n", "runs"]
     assert part == ["known"]
-    assert first[:4] == ["net", "4", "1.25", "+0.688"] and first[-2:] == ["8", "1"]
-    assert second[:4] == ["net", "8", "2.25", "+0.437"] and second[-2:] == ["8", "2"]  # two seeds are pooled
-    assert baseline == ["vs", "mean", "4"]
+    assert first[:4] == ["net", "4", "1.25", "+68.8"] and first[-2:] == ["8", "1"]
+    # 43.75 is rounded either way, as the processor sums; two seeds are pooled
+    assert second[:3] == ["net", "8", "2.25"] and second[3] in ("+43.7", "+43.8") and second[-2:] == ["8", "2"]
+    assert baseline == ["than", "mean", "4"]
 
 
 def test_without_pooling_each_result_is_a_row_named_by_its_path_with_its_seed() -> None:
     head, _, *rows = lines(compared(*WIDTHS, pool=False))
 
-    assert head == ["width", "seed", "error", "skill", "95", "%", "interval", "n"]
+    assert head == ["width", "seed", "error", "less", "error", "95", "%", "interval", "n"]
     assert [row[0] for row in rows[:3]] == ["small/0", "large/0", "large/1"]
     assert [row[2] for row in rows[1:3]] == ["0", "1"]
 
@@ -87,15 +88,15 @@ def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interva
     comparison = compared(*named_results)
 
     assert [line for line in lines(comparison) if line in (["known"], ["unseen"])] == [["known"], ["unseen"]]
-    (table,) = comparison.tables()
+    ((_, table),) = comparison.tables()
     assert all(len(line) <= 80 for line in table.text(80).splitlines())
     assert "95 % interval" in table.text(40).splitlines()[0]
 
 
 def test_too_few_recordings_for_a_verdict_are_stated() -> None:
     comparison = compared(weigh(SMALL[:3], "a"))
-    assert f"below {headline.MIN_CLUSTERS}" in comparison.tables()[0].caption
-    assert "below" not in compared(*WIDTHS).tables()[0].caption
+    assert f"below {headline.MIN_CLUSTERS}" in comparison.tables()[0][1].caption
+    assert "below" not in compared(*WIDTHS).tables()[0][1].caption
 
 
 def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None:
@@ -168,7 +169,7 @@ def test_errors_in_other_units_are_other_comparisons_with_their_own_unit() -> No
         )
 
     comparison = compared(weigh(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
-    first, second = comparison.tables()
+    first, second = (table for _, table in comparison.tables())
     assert "Units: N." in first.caption and "Units: mN." in second.caption
     assert [[float(row.cells[1]) for row in table.groups[0].rows] for table in (first, second)] == [
         [1.25, 4.0],

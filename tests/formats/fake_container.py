@@ -9,18 +9,15 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.container import EpisodeContents, SourceStream, Time
+from tacpipe.formats.container import Container, EpisodeContents, SourceStream, Time
 
 
 @dataclass(frozen=True)
-class Fake:
+class Fake(Container):
     path: Path
 
     def episodes(self) -> Sequence[str]:
         return list(self._content().get("episodes", {}))
-
-    def look(self, episode: str | None) -> EpisodeContents:
-        return self.read(None, episode)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> EpisodeContents:
         content = self._content()

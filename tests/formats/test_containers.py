@@ -1,6 +1,7 @@
 """Parts that all formats of containers share, tried with a fake container."""
 
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,13 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import container
 from tacpipe.formats.container import Kind
-from tacpipe.formats.table import contained, layout, recordings
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table import contained
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats import fake_container
 from tests.formats.builders import layout_params
 
-COMMAND = ContainerCommand("xdf")
+COMMAND = LayoutCommand("xdf")
 NONE = Params()
 
 
@@ -70,9 +71,9 @@ def test_a_layout_of_a_table_reads_a_container_beside_a_csv(tmp_path: Path) -> N
     time = { column = "time" }
     columns = [{ match = "x" }]
     """
-    result = layout.parse_layout(text)
-    sources = contained.discover_sources(result, tmp_path, recordings.find_recordings(result, tmp_path))
-    output = contained.read_recording(result, None, sources["t1"].files, sources["t1"].values)
+    command, params = LayoutCommand(None), Params(layout=json.dumps(tomllib.loads(text)))
+    source = command.discover(params, tmp_path)["t1"]
+    output = command.read(params, source.files, source.values)
     assert {name: len(table.read_all() if name == "arm" else table) for name, table in output.streams.items()} == {
         "skin": 2,
         "arm": 1,

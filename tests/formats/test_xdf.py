@@ -17,12 +17,12 @@ import pyxdf
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import xdf_streams
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.xdf_writer import Writer
 
-XDF = ContainerCommand("xdf")
+XDF = LayoutCommand("xdf")
 xdf = registry.load("ingest.xdf")
 RNG = np.random.default_rng(8)
 SAMPLE_DATA = os.environ.get("TACPIPE_SAMPLE_DATA")

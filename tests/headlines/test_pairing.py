@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
 from tacpipe.cli import headline_table
-from tacpipe.metrics import headline as headlines
-from tacpipe.metrics import pairing, regression
+from tacpipe.scores import headline, pairing, regression, words
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.touch import headline as touch
@@ -122,7 +123,7 @@ def test_a_few_recordings_that_carry_most_of_the_error_give_no_verdict() -> None
     assert result is not None and result.low > 0
     assert result.effective == pytest.approx(99**2 / (40**2 + 30**2 + 20**2 + 9))
     assert result.verdict == ""
-    assert "12 grasps count as 3.4 equal ones, too few for a verdict" in headlines.sentence(result)
+    assert "12 grasps count as 3.4 equal ones, and 6 are needed" in words.sentence(result)
     model, persistence = dict[Any, Any](), dict[Any, Any]()
     for name, size in sizes.items():
         model |= forecasts({name: 0.5}, persistence=size)
@@ -137,7 +138,7 @@ def test_recordings_on_which_persistence_makes_no_error_are_left_out_and_counted
     result = forward.headline("net", (1,), {**model, **quiet}, {"persistence": {**persistence, **quiet}}, None)
     assert result is not None
     assert result.gain == pytest.approx(0.5) and (result.clusters, result.left_out) == (12, 1)
-    assert "Left out: 1 recording without an error of persistence." in headlines.caption([result])
+    assert "Left out: 1 recording without an error of persistence." in words.legend([result])
 
 
 def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> None:
@@ -147,9 +148,9 @@ def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> N
     assert result is not None and [baseline.name for baseline in result.table_baselines] == ["ridge", "persistence"]
     table = headline_table.text([result])
     row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
-    assert row[-2:] == ["0", "0"]
-    assert "vs ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
-    summary_values = headlines.summarize([result])
+    assert row[-2:] == ["0.0", "%"]
+    assert "than ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
+    summary_values = headline.summarize([result])
     assert (summary_values["mae_t_1"], summary_values["persistence_mae_t_1"]) == (0.5, 1.0)
 
 
@@ -200,3 +201,34 @@ def test_seeds_are_left_out_as_recordings_are() -> None:
 
 def test_a_model_without_recordings_has_no_headline() -> None:
     assert pairing.headline("t", "net", forward.measure((1,)), {}, {}) is None
+
+
+def points_of(model_right: list[bool], baseline_right: list[bool]) -> pairing.Pair:
+    """Return the pair of two predictors that named slides right or wrong."""
+    sums: list[Any] = [
+        {(0, f"s{index}"): np.array([float(right), 1.0]) for index, right in enumerate(answers)}
+        for answers in (model_right, baseline_right)
+    ]
+    pair = pairing.pair(material.MEASURE, *sums)
+    assert pair is not None
+    return pair
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=6, max_size=40))
+def test_an_interval_in_points_is_bounded_and_never_empty_and_a_verdict_agrees_with_the_exact_test(
+    answers: list[tuple[bool, bool]],
+) -> None:
+    pair = points_of(*(list(column) for column in zip(*answers, strict=True)))
+    gain = pairing.gain(material.MEASURE, [pair])
+    assert -100 <= gain.low <= gain.mean <= gain.high <= 100 and gain.low < gain.high
+    assert gain.verdict == "unclear" or pair.p <= 0.05
+
+
+def test_the_cases_of_18_slides_have_intervals_that_a_reader_can_trust() -> None:
+    equal = pairing.gain(material.MEASURE, [points_of([True] * 18, [True] * 18)])
+    assert (equal.low, equal.high) == pytest.approx((-12.06, 12.06), abs=0.01)
+    four = pairing.gain(material.MEASURE, [points_of([True] * 18, [True] * 14 + [False] * 4)])
+    assert four.mean == pytest.approx(22.2, abs=0.1) and four.verdict == "unclear"  # p is 0.125
+    fifteen = pairing.gain(material.MEASURE, [points_of([False] * 15 + [True] * 3, [True] * 18)])
+    assert fifteen.low == -100 and fifteen.high < -60 and fifteen.verdict == "worse"

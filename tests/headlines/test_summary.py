@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from tacpipe.metrics import headline
-from tacpipe.metrics.headline import Headline, HeadlineRow
+from tacpipe.scores import headline
+from tacpipe.scores.headline import Headline, HeadlineRow
 from tests.test_headline import ONE
 
 

@@ -20,10 +20,12 @@ from tacpipe.links import opening as dialogue_of
 from tacpipe.links.link import Arrived, Link
 from tacpipe.links.opening import run_dialogue
 from tacpipe.recording import rig
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.sensor import Ask, Dialogue
+from tests.emulation.devices import device_for
 from tests.links import peers
 from tests.links.peers import SOON_S, Quiet, open_address
-from tests.sensors.made import pieces, samples
+from tests.sensors.made import samples
 
 Talk = Callable[[bytes, list[bytes]], None]
 LEAST_S = 1.0  # a reply that is awaited for so long is to come; what is to be silent is awaited for less
@@ -147,8 +149,8 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
 ) -> None:
     link, talk = device
     sensor = rig.build_sensor(kind, {}, "stream")
-    sent = iter(pieces(sensor, sensor.encode(samples(kind, sensor, 40, seed=4))))
-    end = sensor.device()
+    sent = iter(split_frames(sensor, sensor.encode(samples(kind, sensor, 40, seed=4))))
+    end = device_for(sensor)
     end.streaming = True  # an earlier session left it so
     streamed_frames: list[bytes] = []
 

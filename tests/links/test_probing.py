@@ -22,6 +22,7 @@ from tacpipe.recording import rig
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor
 from tests.conftest import Lab
+from tests.emulation.devices import device_for
 
 RNG = np.random.default_rng(7)
 
@@ -54,7 +55,7 @@ def play(sensor: Sensor, frames: list[bytes]) -> Iterator[tuple[str, list[bytes]
     heard: list[bytes] = []
 
     def run() -> None:
-        device, number = sensor.device(), 0
+        device, number = device_for(sensor), 0
         while not over.wait(0.002):
             while select.select([master], [], [], 0)[0]:
                 heard.append(os.read(master, 1000))

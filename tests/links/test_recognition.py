@@ -9,6 +9,7 @@ import pytest
 from tacpipe.links.probing import CERTAIN, recognise
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor
 from tests.sensors import made
@@ -111,7 +112,7 @@ def test_packets_are_told_by_their_size_and_marks() -> None:
 @pytest.mark.parametrize("kind", [kind for kind in registry.sensors() if kind not in ("generic", "lsl")])
 def test_every_driver_comes_first_for_its_own_frames(kind: str) -> None:
     sensor = rigged(kind, made.OPTIONS.get(kind, {}))
-    pieces = made.pieces(sensor, sensor.encode(made.samples(kind, sensor, 200)))
+    pieces = split_frames(sensor, sensor.encode(made.samples(kind, sensor, 200)))
     period_ns = int(1e9 / (sensor.rate_hz or 100) * 200 / len(pieces))  # a sample may be several packets
     data = Chunks.from_pairs([(number * period_ns, piece) for number, piece in enumerate(pieces)])
 
@@ -121,7 +122,7 @@ def test_every_driver_comes_first_for_its_own_frames(kind: str) -> None:
 
 def test_frames_of_a_board_of_ones_own_are_taken_for_no_product() -> None:
     sensor = rigged("generic", made.OPTIONS["generic"])
-    pieces = made.pieces(sensor, sensor.encode(made.samples("generic", sensor, 200)))
+    pieces = split_frames(sensor, sensor.encode(made.samples("generic", sensor, 200)))
 
     assert (
         recognise(Chunks.from_pairs([(number * 10**6, piece) for number, piece in enumerate(pieces)]), "serial") == []

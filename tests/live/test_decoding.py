@@ -7,6 +7,7 @@ from tacpipe.live.decoding import Decoder
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import LOST
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tests.sensors import made
 
@@ -16,7 +17,7 @@ ROW_NS = 10**12
 def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
     stream_sensor = rigs.build_sensor(sensor, {}, "stream")
     samples = made.samples(sensor, stream_sensor, 4, 1)
-    return Decoder(stream_sensor), made.pieces(stream_sensor, stream_sensor.encode(samples))
+    return Decoder(stream_sensor), split_frames(stream_sensor, stream_sensor.encode(samples))
 
 
 @pytest.mark.parametrize(("arrived_ns", "waits"), [(ROW_NS - 1, True), (ROW_NS, True), (ROW_NS + 1, False)])

@@ -10,6 +10,7 @@ from tacpipe.live import wire
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, LOST
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward.live.chain import Cause
@@ -32,7 +33,7 @@ class Session:
         self.engine.resting_ns = 0
         samples = made.samples("xela", self.sensor, count, 1)
         self.values = np.hstack(samples.values).astype(np.float32)
-        self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
+        self.packets = split_frames(self.sensor, self.sensor.encode(samples))
 
     def begin(self) -> None:
         """Begin a recording."""

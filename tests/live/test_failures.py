@@ -15,8 +15,8 @@ import pytest
 
 from tacpipe.live.preparation import free_ports
 from tacpipe.live.session import DIED, RESTARTED
-from tacpipe.simulation.emulation.byte_faults import Faults
 from tests.conftest import Lab
+from tests.emulation.byte_faults import Faults
 from tests.live.persistent import GAP_NS, PERIOD_NS
 from tests.live.sessions import ended, forecasts, model_process, started, subscriber, whole
 from tests.live.test_publishers import HANDSHAKE

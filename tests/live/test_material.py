@@ -12,11 +12,12 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import wire
 from tacpipe.live.messages import packets
 from tacpipe.live.settings import Settings
-from tacpipe.metrics import calibration
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, OVER
+from tacpipe.scores import calibration
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
@@ -33,7 +34,6 @@ from tacpipe.tasks.material.model import predictions
 from tacpipe.tasks.task import CalibrationRequest
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
-from tests.sensors import made
 from tests.simulation.slide_datasets import SEED, indices, slides
 from tests.stage_params import fitting
 from tests.tasks.material.textures import Slide
@@ -97,7 +97,7 @@ class Session:
         values = np.column_stack([self.table.column(name).to_numpy() for name in names]).astype(np.uint16)
         self.t_ns = self.table.column("t_ns").to_numpy() - OFFSET_NS
         samples = Samples((values,), seq=np.arange(len(values)))
-        self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
+        self.packets = split_frames(self.sensor, self.sensor.encode(samples))
         self.sent = 0
 
     def begin(self) -> None:

@@ -1,5 +1,6 @@
 """Subscribers get each message as it was published, and one that is slow costs nobody else anything."""
 
+import asyncio
 import contextlib
 import json
 import socket
@@ -139,6 +140,18 @@ def test_a_client_that_sends_more_than_a_subscriber_needs_is_ended(
         awaited(lambda: publisher.subscribers == 1)
         publisher.publish(message(1))
         assert json.loads(quiet.recv(60))["seq"] == 1
+
+
+def test_a_closed_server_leaves_no_task_of_clients_that_never_sent_their_request() -> None:
+    port = free_port()
+    publisher = WebsocketPublisher(f"127.0.0.1:{port}", ABOUT)
+    loop = publisher._loop
+    with contextlib.ExitStack() as opened:
+        for _ in range(CONNECTIONS):
+            opened.enter_context(socket.create_connection(("127.0.0.1", port)))
+        awaited(lambda: len(publisher._connections) == CONNECTIONS)
+        publisher.close()
+        assert not asyncio.all_tasks(loop) and loop.is_closed()
 
 
 def test_a_web_page_is_refused_unless_the_address_lists_its_origin() -> None:

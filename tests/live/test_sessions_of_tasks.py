@@ -15,9 +15,9 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.live.preparation import free_ports
 from tacpipe.live.session import DIED, RESTARTED
-from tacpipe.metrics import calibration
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation.emulator import Emulator
+from tacpipe.scores import calibration
+from tacpipe.simulation.emulation.emulator import ReplayEmulator
 from tacpipe.tasks.touch.live.messages import COLUMNS
 from tests.conftest import Lab
 from tests.live.sessions import commanded, ended, model_process, subscriber
@@ -37,7 +37,7 @@ def test_the_last_answer_of_a_session_is_what_predict_gives_its_recording(lab: L
         lab.run(command)
     rig = rig_of.read(live.ROOT / "rigs" / "slide.toml")
     with (
-        Emulator(rig, 5, folder=lab.folder / "emulated", patient=True) as emulator,
+        ReplayEmulator(rig, tacpipe.open("data/r"), lab.folder / "emulated") as emulator,
         subscriber() as (port, messages),
     ):
         (lab.folder / "rig.toml").write_text(rig_of.to_toml(emulator.rig))

@@ -10,6 +10,7 @@ from tacpipe.errors import UsageError
 from tacpipe.live.decoding import likely_schema
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.reading import LinkReader
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward import causal
@@ -55,7 +56,7 @@ def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> 
             break
         before += block_values.shape[1]
     assert samples.values[block].shape[0] == 40
-    packets = made.pieces(sensor, sensor.encode(samples))
+    packets = split_frames(sensor, sensor.encode(samples))
     batch = LinkReader(sensor).feed(Chunks.from_pairs(list(zip(t_ns.tolist(), packets, strict=True))))
     from tacpipe.live.decoding import BatchColumns, batch_schema
 

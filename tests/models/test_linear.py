@@ -1,7 +1,5 @@
 """The linear baselines, against plain loops, scikit-learn and processes whose future is known."""
 
-import itertools
-
 import numpy as np
 import pytest
 from safetensors.numpy import load, save
@@ -11,7 +9,7 @@ from sklearn.preprocessing import StandardScaler
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models import linear
-from tacpipe.models.linear import FittedBaselines, Windows
+from tacpipe.models.linear import Autoregression, ChangeMap, FittedBaselines, PlanByLoad, Windows
 
 CONTEXT, HORIZON, CHANNELS, STATES = 5, 4, 3, 2
 
@@ -35,9 +33,20 @@ def walk(seed: int, rows: int = 200, context: int = CONTEXT) -> Windows:
     return cut(values, motion, context)
 
 
+def fit(training: Windows, validation: Windows) -> FittedBaselines:
+    """Fit the baselines, with all validation windows of one recording."""
+    return FittedBaselines.fit(training, validation, np.zeros(len(validation[0]), np.int64))
+
+
+def change_maps(baselines: FittedBaselines) -> tuple[ChangeMap, ChangeMap]:
+    autoregression, plan_by_load = baselines.change_maps
+    assert isinstance(autoregression, Autoregression) and isinstance(plan_by_load, PlanByLoad)
+    return autoregression, plan_by_load
+
+
 @pytest.fixture(scope="module")
 def fitted() -> FittedBaselines:
-    return FittedBaselines.fit(walk(1), walk(2))
+    return fit(walk(1), walk(2))
 
 
 def features(part: Windows, plan: bool) -> np.ndarray:
@@ -70,54 +79,118 @@ def test_a_ridge_is_that_of_scikit_learn_at_the_alpha_that_validates_best(
     np.testing.assert_allclose(fitted.predict(*validation[:2])[name], expected, atol=0.01)
 
 
-@pytest.mark.parametrize("repeats", [1, 3])
-def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(repeats: int) -> None:
-    frames = walk(1)[0][:, -1].repeat(repeats, axis=0)  # (time, channel), each frame held
-    windows = cut(frames, np.zeros((len(frames), STATES)))
-    past, _, ahead = (array.astype(np.float64) for array in windows)
-    fitted = FittedBaselines.fit(windows, windows)
-
-    def trend(phi: float, lag: int) -> np.ndarray:
-        slope = (past[:, -1] - past[:, -1 - lag]) / lag
-        return np.stack([past[:, -1] + sum(phi**k for k in range(1, h + 1)) * slope for h in range(1, HORIZON + 1)], 1)
-
-    grid = list(itertools.product(linear.PHIS, range(1, CONTEXT)))
-    phi, lag = min(grid, key=lambda array: float(np.square(trend(*array) - ahead).sum()))
-    assert (fitted.settings["damped_trend.phi"], fitted.settings["damped_trend.lag"]) == (phi, lag)
-    assert phi > 0
-    assert (lag > 1) == (repeats > 1)
-    np.testing.assert_allclose(fitted.predict(*windows[:2])["damped_trend"], trend(phi, lag), atol=0.01)
+COEFFICIENTS = np.array([[0.5, 0.3, -0.2], [0.2, -0.3, 0.0], [-0.4, 0.0, 0.1]])  # (channel, change), newest first
 
 
-def test_a_trend_that_is_damped_by_0_6_a_step_is_predicted_exactly() -> None:
-    steps = np.outer(0.6 ** np.arange(CONTEXT + HORIZON), [200.0, -100.0, 50.0])
-    values = 1000 + np.cumsum(np.stack([steps, -2 * steps, 3 * steps]), axis=1)
-    windows = values[:, :CONTEXT], np.zeros((3, CONTEXT + HORIZON, STATES)), values[:, CONTEXT:]
-    baselines = FittedBaselines.fit(windows, windows)
-    assert (baselines.phi, baselines.lag) == (0.6, 1)
-    np.testing.assert_allclose(baselines.predict(*windows[:2])["damped_trend"], windows[2], rtol=1e-5)
+def autoregressive(seed: int, repeats: int = 1) -> Windows:
+    """Return windows of channels whose changes follow from their own last three, each row logged ``repeats`` times."""
+    noise = np.random.default_rng(seed).normal(size=(3000, CHANNELS))
+    for row in range(3, len(noise)):
+        noise[row] += (COEFFICIENTS * noise[row - 3 : row][::-1].T).sum(axis=1)
+    values = noise.cumsum(axis=0).repeat(repeats, axis=0)
+    return cut(values, np.zeros((len(values), STATES)), context=4 * repeats)
 
 
-def test_where_nothing_goes_on_the_trend_is_persistence() -> None:
-    rng = np.random.default_rng(3)
-    noise = cut(rng.normal(size=(400, CHANNELS)), np.zeros((400, STATES)))
-    baselines = FittedBaselines.fit(noise, noise)
-    assert (baselines.phi, baselines.lag) == (0.0, 1)
-    assert np.array_equal(baselines.predict(*noise[:2])["damped_trend"], np.repeat(noise[0][:, -1:], HORIZON, axis=1))
+def test_the_autoregression_has_the_coefficients_of_an_autoregressive_process() -> None:
+    autoregression, _ = change_maps(fit(autoregressive(1), autoregressive(2)))
+    newest_is_new = autoregression.weight[:, :3, 0]
+    np.testing.assert_allclose(newest_is_new, COEFFICIENTS, atol=0.06)
+    rows_ahead_2 = COEFFICIENTS[:, :1] * (1 + COEFFICIENTS[:, :1]) + COEFFICIENTS[:, 1:2]
+    np.testing.assert_allclose(autoregression.weight[:, :1, 1], rows_ahead_2, atol=0.08)
 
 
-def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fitted: FittedBaselines) -> None:
-    past, _, ahead = (array.astype(np.float64) for array in walk(1))
-    x = np.concatenate([past[:, :-1, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
-    y = np.concatenate([ahead[:, :, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
-    weight = np.linalg.lstsq(np.hstack([x, np.ones((len(x), 1))]), y, rcond=None)[0]
-    other_windows = walk(2)
-    changes = other_windows[0][:, :-1].astype(np.float64) - other_windows[0][:, -1:]
+def test_the_autoregression_skips_repeated_rows_and_knows_how_old_the_newest_is() -> None:
+    autoregression, _ = change_maps(fit(autoregressive(1, repeats=2), autoregressive(2, repeats=2)))
+    by_age = autoregression.weight.reshape(CHANNELS, -1, 3, HORIZON)
+    np.testing.assert_allclose(by_age[:, 1, :, 0], COEFFICIENTS, atol=0.06)  # the next row is new
+    np.testing.assert_allclose(by_age[:, 0, :, 0], 0, atol=1e-6)  # the next row repeats this one
+    np.testing.assert_allclose(by_age[:, 0, :, 1], COEFFICIENTS, atol=0.06)
+
+
+def test_the_coefficients_of_few_windows_are_those_shared_by_all_channels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear, "ALPHAS", (1e12,))
+    autoregression, _ = change_maps(fit(autoregressive(1), autoregressive(2)))
+    past, _, ahead = (array.astype(np.float64) for array in autoregressive(1))
+    changes = np.diff(past, axis=1)[:, ::-1].transpose(2, 0, 1).reshape(-1, 3)  # newest first, of all channels
+    targets = (ahead - past[:, -1:]).transpose(2, 0, 1).reshape(-1, HORIZON)
+    shared = np.linalg.lstsq(changes, targets, rcond=None)[0]
     for channel in range(CHANNELS):
-        expected = other_windows[0][:, -1:, channel] + changes[:, :, channel] @ weight[:-1] + weight[-1]
-        np.testing.assert_allclose(
-            fitted.predict(*other_windows[:2])["last_value_linear"][:, :, channel], expected, atol=0.01
-        )
+        np.testing.assert_allclose(autoregression.weight[channel, :3], shared, atol=1e-4)
+
+
+def test_where_nothing_goes_on_the_autoregression_is_persistence() -> None:
+    def steps(seed: int) -> Windows:
+        return cut(np.random.default_rng(seed).normal(size=(2000, CHANNELS)).cumsum(axis=0), np.zeros((2000, STATES)))
+
+    baselines = fit(steps(3), steps(4))
+    past, motion, _ = steps(5)
+    assert np.array_equal(baselines.predict(past, motion)["autoregression"], np.repeat(past[:, -1:], HORIZON, axis=1))
+
+
+def carried(seed: int) -> Windows:
+    """Return windows in which the planned motion changes each channel in proportion to the load, which varies widely."""
+    rng = np.random.default_rng(seed)
+    level = rng.lognormal(5, 1, (800, 1, 1)) * [[[1.0, -0.5, 2.0]]]
+    motion = rng.normal(size=(800, CONTEXT + HORIZON, STATES))
+    load = np.abs(level).mean(axis=2, keepdims=True)
+    ahead = level + load * (motion[:, CONTEXT:] @ [[0.1, 0.2, -0.1], [0.3, 0.0, 0.2]])
+    past = np.repeat(level, CONTEXT, axis=1)
+    return past.astype(np.float32), motion.astype(np.float32), ahead.astype(np.float32)
+
+
+def test_a_motion_whose_effect_grows_with_the_load_is_predicted_by_the_plan_times_the_load_alone() -> None:
+    predicted = fit(carried(1), carried(2)).predict(*carried(3)[:2])
+    past, _, ahead = carried(3)
+    persistence = np.abs(ahead - past[:, -1:]).mean()
+    error = {name: np.abs(values - ahead).mean() / persistence for name, values in predicted.items()}
+    assert error["plan_by_load"] < 0.03
+    assert error["ridge_actions"] > 0.3
+    assert error["ridge"] > 0.9
+
+
+def test_the_plan_times_the_load_is_the_ridge_of_scikit_learn_without_intercept(fitted: FittedBaselines) -> None:
+    past, motion, ahead = (array.astype(np.float64) for array in walk(1))
+    _, plan_by_load = change_maps(fitted)
+    load = np.abs(past[:, -1]).mean(axis=1, keepdims=True)
+    for step in range(HORIZON):
+        x = np.hstack([motion[:, CONTEXT - 1], motion[:, CONTEXT + step]]) * load
+        scale = np.sqrt(np.square(x).mean(axis=0))
+        oracle = Ridge(plan_by_load.alpha, fit_intercept=False).fit(x / scale, ahead[:, step] - past[:, -1])
+        np.testing.assert_allclose(plan_by_load.weight[step], (oracle.coef_ / scale).T, rtol=1e-3, atol=1e-6)
+
+
+def test_a_step_does_not_depend_on_the_plan_after_it() -> None:
+    past, motion, _ = carried(3)
+    changed = motion.copy()
+    changed[:, CONTEXT + 2 :] += 1
+    baselines = fit(carried(1), carried(2))
+    before, after = (baselines.predict(past, planned)["plan_by_load"] for planned in (motion, changed))
+    assert np.array_equal(before[:, :2], after[:, :2])
+    assert not np.isclose(before[:, 2:], after[:, 2:]).any()
+
+
+def test_validation_windows_choose_alphas_and_weights_per_step_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(linear, "ALPHAS", (10.0,))
+    first, second = (fit(walk(1), walk(seed)).to_tensors() for seed in (2, 5))
+    assert [name for name in first if not np.array_equal(first[name], second[name])] == ["autoregression.shrinkage"]
+
+
+def test_on_the_validation_recordings_changes_are_shrunk_until_they_err_no_more_than_persistence() -> None:
+    past, motion, ahead = walk(2)
+    recordings = np.arange(len(past)) * 3 // len(past)
+    baselines = FittedBaselines.fit(walk(1), (past, motion, ahead), recordings)
+    still = np.abs(past[:, -1:] - ahead).mean(axis=2)
+    predicted = baselines.predict(past, motion)
+    for fitted in change_maps(baselines):
+        ratios = [
+            np.abs(predicted[fitted.NAME] - ahead).mean(axis=2)[recordings == number].mean(axis=0)
+            / still[recordings == number].mean(axis=0)
+            for number in range(3)
+        ]
+        assert (np.mean(ratios, axis=0) <= 1 + 1e-6).all()
+        assert ((fitted.shrinkage >= 0) & (fitted.shrinkage <= 1)).all()
 
 
 def test_the_mean_is_that_of_what_was_to_be_predicted_in_training(fitted: FittedBaselines) -> None:
@@ -132,27 +205,31 @@ def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
         acceleration = np.random.default_rng(seed).normal(size=(600, 1))
         return cut(2 * 300 * acceleration * [[1.0, 0.5, -0.2]], np.hstack([acceleration, np.zeros_like(acceleration)]))
 
-    baselines = FittedBaselines.fit(held_mass(1), held_mass(2))
+    baselines = fit(held_mass(1), held_mass(2))
     past, motion, ahead = held_mass(3)
     predicted = baselines.predict(past, motion)
     error = {name: float(np.square(values - ahead).mean()) for name, values in predicted.items()}
     assert error["ridge_actions"] < 0.01 * error["train_mean"]
     assert error["ridge"] > 0.9 * error["train_mean"]
-    assert error["damped_trend"] > error["train_mean"]
+    assert error["autoregression"] > error["train_mean"]
 
 
-def test_only_the_ridge_with_actions_knows_the_plan(fitted: FittedBaselines) -> None:
-    past, motion, _ = walk(2)
+def test_two_baselines_know_the_plan() -> None:
+    past, motion, _ = carried(3)
     changed = motion.copy()
     changed[:, CONTEXT:] += 0.1
-    before, after = fitted.predict(past, motion), fitted.predict(past, changed)
-    assert [name for name in linear.NAMES if not np.array_equal(before[name], after[name])] == ["ridge_actions"]
+    baselines = fit(carried(1), carried(2))
+    before, after = baselines.predict(past, motion), baselines.predict(past, changed)
+    differing = [name for name in linear.NAMES if not np.array_equal(before[name], after[name])]
+    assert differing == ["plan_by_load", "ridge_actions"]
 
 
-def test_all_but_the_mean_move_with_the_level_of_the_counts(fitted: FittedBaselines) -> None:
+def test_all_but_the_mean_and_the_plan_times_the_load_move_with_the_level_of_the_counts(
+    fitted: FittedBaselines,
+) -> None:
     past, motion, _ = walk(2)
     before, after = fitted.predict(past, motion), fitted.predict(past + np.float32(512), motion)
-    for name in linear.NAMES:
+    for name in set(linear.NAMES) - {"plan_by_load"}:
         np.testing.assert_allclose(after[name] - before[name], 0 if name == "train_mean" else 512, atol=0.01)
 
 
@@ -164,7 +241,7 @@ def test_a_forecast_does_not_depend_on_the_windows_beside_it_nor_the_fit_on_its_
     for name in linear.NAMES:
         np.testing.assert_allclose(single[name][0], batched[name][9], rtol=1e-5)
     monkeypatch.setattr(linear, "CHUNK", 7)
-    pieces = FittedBaselines.fit(walk(1), walk(2)).predict(past, motion)
+    pieces = fit(walk(1), walk(2)).predict(past, motion)
     for name in linear.NAMES:
         np.testing.assert_allclose(pieces[name], batched[name], rtol=1e-5)
 
@@ -177,12 +254,12 @@ def test_channels_and_states_that_stand_still_in_training_are_left_where_they_ar
         motion[:, :, 0] = np.nextafter(np.float32(0.3), sides)  # still but for the last bit
         return past, motion, ahead
 
-    baselines = FittedBaselines.fit(constant_windows(1), constant_windows(2))
+    baselines = fit(constant_windows(1), constant_windows(2))
     past, motion, _ = constant_windows(3)
     stirred = motion.copy()
     stirred[:, :, 0] += 1
     predicted = baselines.predict(past, motion)
-    for name in ("train_mean", "damped_trend", "ridge", "ridge_actions"):
+    for name in ("train_mean", "autoregression", "ridge", "ridge_actions"):
         np.testing.assert_allclose(predicted[name][:, :, 1], 77.1, rtol=1e-5)
         assert np.isfinite(predicted[name]).all()
         assert np.array_equal(baselines.predict(past, stirred)[name], predicted[name])
@@ -190,17 +267,16 @@ def test_channels_and_states_that_stand_still_in_training_are_left_where_they_ar
 
 def test_windows_in_which_nothing_moves_give_persistence() -> None:
     constant_windows = cut(np.full((30, CHANNELS), 5.0), np.full((30, STATES), 0.3))
-    baselines = FittedBaselines.fit(constant_windows, constant_windows)
+    baselines = fit(constant_windows, constant_windows)
     for values in baselines.predict(*constant_windows[:2]).values():
         np.testing.assert_allclose(values, 5.0)
 
 
-def test_a_single_past_frame_has_no_trend_but_a_motion() -> None:
-    baselines = FittedBaselines.fit(walk(1, context=1), walk(2, context=1))
+def test_a_single_past_frame_has_no_changes_but_a_motion() -> None:
+    baselines = fit(walk(1, context=1), walk(2, context=1))
     past, motion, _ = walk(3, context=1)
     predicted = baselines.predict(past, motion)
-    assert baselines.settings["damped_trend.lag"] == 0
-    assert np.array_equal(predicted["damped_trend"], np.repeat(past, HORIZON, axis=1))
+    assert np.array_equal(predicted["autoregression"], np.repeat(past, HORIZON, axis=1))
     assert np.ptp(predicted["ridge"] - past) > 1
 
 
@@ -215,22 +291,33 @@ def test_baselines_read_back_are_the_same(fitted: FittedBaselines) -> None:
         assert after[name].dtype == np.float32
 
 
+def test_a_model_without_an_autoregression_keeps_its_other_baselines(fitted: FittedBaselines) -> None:
+    """Models from before version 8 of `train forward` have two others instead, which are not read."""
+    stored = {
+        name: values
+        for name, values in fitted.to_tensors().items()
+        if not name.startswith(("autoregression", "plan_by_load"))
+    }
+    read = FittedBaselines.from_tensors({**stored, "damped_trend.phi": np.ones(1)})
+    assert set(read.predict(*walk(2)[:2])) == {"train_mean", "ridge", "ridge_actions"}
+
+
 def test_windows_that_are_none_or_do_not_fit_are_refused() -> None:
     past, motion, ahead = walk(1)
     none = past[:0], motion[:0], ahead[:0]
     with pytest.raises(TacpipeError, match="training recordings contain no window"):
-        FittedBaselines.fit(none, walk(2))
+        fit(none, walk(2))
     with pytest.raises(TacpipeError, match="validation recordings contain no window"):
-        FittedBaselines.fit(walk(1), none)
+        fit(walk(1), none)
     for part in ((past, motion[:, 1:], ahead), (past, motion, ahead[:, :, 1:]), (past[1:], motion, ahead)):
         with pytest.raises(TacpipeError, match="do not match"):
-            FittedBaselines.fit(part, walk(2))
+            fit(part, walk(2))
     with pytest.raises(TacpipeError, match="do not fit training windows"):
-        FittedBaselines.fit(walk(1), (past[:, 1:], motion[:, 1:], ahead))
+        fit(walk(1), (past[:, 1:], motion[:, 1:], ahead))
     broken = past.copy()
     broken[3, 2, 1] = np.nan
     with pytest.raises(TacpipeError, match="not finite"):
-        FittedBaselines.fit((broken, motion, ahead), walk(2))
+        fit((broken, motion, ahead), walk(2))
 
 
 def test_a_past_that_was_not_fitted_is_refused(fitted: FittedBaselines) -> None:

@@ -1,11 +1,8 @@
-import gc
-
 import pytest
 import torch
 from torch import Tensor, nn
 
 from tacpipe.models import lstm as lstm_layers
-from tacpipe.models import lstm as module
 from tacpipe.models.lstm import lstm
 
 INPUT, HIDDEN, LEAD = 3, 5, 2
@@ -103,27 +100,6 @@ def test_the_same_batch_twice_gives_the_same_bits() -> None:
         assert torch.equal(gradient, repeated)
 
 
-def test_memory_is_lent_again_only_once_nobody_looks_at_it() -> None:
-    values = arguments(6, 4)
-    states = outputs(*values)[0]
-    view, before = states[2:], states.clone()
-    loss = states.square().mean()
-    del states
-    for seed in range(20):
-        outputs(*(value + seed for value in values))[0].square().mean().backward()  # type: ignore[no-untyped-call]
-    assert torch.equal(view, before[2:])
-    fresh = outputs(*values)[0].square().mean()
-    for value, fresh_value in zip(torch.autograd.grad(loss, values), torch.autograd.grad(fresh, values), strict=True):
-        assert torch.equal(value, fresh_value)
-
-
-def test_little_memory_is_kept() -> None:
-    for windows in range(1, 60):
-        outputs(*arguments(2, windows))[0].mean().backward()  # type: ignore[no-untyped-call]
-    gc.collect()
-    assert len(module._free) <= 16
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_outputs_and_gradients_are_those_of_the_processor() -> None:
     values = arguments(4, 3)
@@ -139,26 +115,19 @@ def test_on_a_gpu_outputs_and_gradients_are_those_of_the_processor() -> None:
         assert torch.allclose(local, remote.cpu(), atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
-def test_where_a_layer_would_be_would_use_float16_it_is_in_float32(
-    kind: type[nn.GRU | nn.LSTM], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    layer, inputs = kind(3, 5), torch.randn(7, 2, 3)
+def test_an_lstm_is_in_float32_under_autocast() -> None:
+    layer, inputs = nn.LSTM(3, 5), torch.randn(7, 2, 3)
     state = torch.randn(1, 2, 5)
-    initial = (state, state) if kind is nn.LSTM else state
-    expected, _ = lstm_layers.run_layer(layer, inputs, initial)
+    expected, _ = lstm_layers.run_layer(layer, inputs, (state, state))
     with torch.autocast("cpu", torch.bfloat16):
-        reduced, _ = lstm_layers.run_layer(layer, inputs, initial)
-        monkeypatch.setattr(lstm_layers, "would_use_float16", lambda _: True)
-        widened, _ = lstm_layers.run_layer(layer, inputs, initial)
-    assert torch.equal(widened, expected) and widened.dtype == torch.float32
-    assert not torch.equal(reduced, expected)
+        states, _ = lstm_layers.run_layer(layer, inputs.bfloat16(), (state, state))
+        same, _ = lstm_layers.run_layer(layer, inputs, (state, state))
+    assert torch.equal(same, expected) and states.dtype == torch.float32
 
 
-def test_so_is_a_layer_of_weights_that_were_computed_in_fewer_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lstm_layers, "would_use_float16", lambda _: True)
+def test_a_layer_is_in_float32_under_autocast_also_if_its_weights_were_computed_in_fewer_digits() -> None:
     weights = torch.randn(20, 3), torch.randn(20, 5).bfloat16(), torch.randn(20)
     state = torch.randn(2, 5).bfloat16(), torch.randn(2, 5)
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+    with torch.autocast("cpu", torch.bfloat16):
         states, _ = lstm(torch.randn(4, 2, 3), state, weights)
     assert states.dtype == torch.float32

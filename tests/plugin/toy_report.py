@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question, TaskReport
-from tacpipe.metrics.pairing import Measure
+from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
+from tacpipe.report.context import TaskReport
+from tacpipe.scores.pairing import Measure
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins.stage import RecordingOutput, Result, stage
+from tacpipe.plugins.stage import Discovery, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,7 +49,7 @@ def discover(params: Read, source: Path) -> dict[str, dict[str, Path]]:
     return {file.stem: {file.name: file} for file in sorted(source.glob("*.txt"))}
 
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def read(params: Read, files: Files) -> RecordingOutput:
     """Return the numbers of a text file, one a line."""
     import pyarrow as pa
@@ -100,8 +100,8 @@ def fit(params: Read, train: Dataset) -> Result:
     return Result(files={"codec.json": f"{values.mean():.6f}".encode()})
 
 
-@stage(version=1, fit=fit)
-def centre(params: Read, recording: Recording, codec: Fitted) -> pa.Table:
+@stage(version=1)
+def centre(params: Read, recording: Recording, codec: Annotated[Fitted, fit]) -> pa.Table:
     """Return the table with the training mean taken off."""
     import pyarrow as pa
     import pyarrow.compute as pc

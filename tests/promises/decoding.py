@@ -9,7 +9,8 @@ import numpy as np
 from tacpipe.recording import rig
 from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Sensor
-from tests.sensors import harm, made
+from tacpipe.testing import byte_faults
+from tacpipe.testing.frames import decode_runs, rows_as_bytes
 from tests.sensors.test_every_sensor import CASES, sent
 
 FRAMES = 30  # Number of frames in an example.
@@ -29,14 +30,14 @@ def examples(case: str) -> list[bytes]:
     streams = []
     for seed in (0, 1):
         recorded = sent(case, FRAMES, seed)
-        parts = [part for piece in recorded.pieces for part in harm.packets(recorded.sensor, piece)]
-        streams.append((b"" if harm.is_stream(recorded.sensor) else CUT).join(parts))
+        parts = [part for piece in recorded.frames for part in byte_faults.packets_of(recorded.sensor, piece)]
+        streams.append((b"" if byte_faults.is_byte_stream(recorded.sensor) else CUT).join(parts))
     return streams
 
 
 def chunks(case: str, data: bytes, sizes: Sequence[int] = (64,)) -> list[bytes]:
     """Return what a link gives: its packets, or a stream in chunks of these sizes, over and over."""
-    if not harm.is_stream(sensor(case)):
+    if not byte_faults.is_byte_stream(sensor(case)):
         return data.split(CUT)
     pieces, place, number = [], 0, 0
     while place < len(data):
@@ -70,8 +71,8 @@ def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: in
 def rows(tested_sensor: Sensor, runs: Sequence[FrameRun]) -> list[bytes]:
     """Return the samples of runs, each as its bytes."""
     with np.errstate(all="ignore"):
-        decoded: Any = made.decoded(tested_sensor, runs)
-    return made.rows(decoded) if len(decoded) else []
+        decoded: Any = decode_runs(tested_sensor, runs)
+    return rows_as_bytes(decoded) if len(decoded) else []
 
 
 def run(case: str, data: bytes) -> list[bytes]:

@@ -273,11 +273,22 @@ STAGES = (
         sources=lambda lab: _publish("gelsight-slip", lab / "src"),
     ),
     Case("segment.slips", "segment slips data/even -o data/slips", EVEN),
+    Case("segment.blocks", "segment blocks data/r -o data/blocks --parts 2", HELD[:2]),
     Case("segment.losses", "segment losses data/r -o data/losses --streams xela*", HELD[:2]),
     Case(
         "train.slip",
         "train slip data/r --split data/split --streams xela* -o models/s --trees 2 --leaf 5 --no-match-time",
         HELD,
+    ),
+    Case(
+        "train.regress",
+        "train regress data/c --split data/split -o models/n --target gt_force_z_n --architecture linear",
+        FORWARD[:4],
+    ),
+    Case(
+        "train.classify",
+        "train classify data/c --split data/split -o models/n --label contact --architecture linear",
+        FORWARD[:4],
     ),
     Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
     Case(

@@ -373,10 +373,10 @@ def _format(name: str, data: bytes) -> object:
 def ingest_recordings(name: str, folder: Path) -> list[Any]:
     """Return the recordings that a format reads in a folder."""
     stage = registry.load(f"ingest.{name}")
-    assert stage.discover is not None
+    assert stage.source is not None
     params = stage.params(**PARAMS.get(name, {}))
     recordings = []
-    for discovered in list(stage.discover(params, folder).values())[:3]:
+    for discovered in list(stage.source.discover(params, folder).values())[:3]:
         source = discovered if isinstance(discovered, Source) else Source(discovered)
         values = {"values": source.values} if stage.argument("Values") else {}
         recording = stage(params, files=source.files, **values)

@@ -87,6 +87,30 @@ def test_processes_that_ask_for_the_same_keys_make_each_once_while_garbage_is_co
     tidy(Store(scene.project / ".tacpipe"))
 
 
+CHAIN = (  # eight commands that read what one command wrote
+    *(f"scale data/r --factor {factor} -o data/s{factor}" for factor in range(2, 8)),
+    "split data/r -o data/split",
+    "scale data/r --factor 2 -o data/again",
+)
+
+
+@pytest.mark.long
+def test_eight_commands_of_a_chain_give_at_once_what_they_give_one_after_another(scene: Scene) -> None:
+    scene.run("simulate toy --trials 6 --rows 4 -o data/r")
+    for command in CHAIN:
+        scene.run(command)
+    outputs = [command.split()[-1] for command in CHAIN]
+    expected = [(scene.project / output / "manifest.json").read_bytes() for output in outputs]
+    for output in outputs:
+        shutil.rmtree(scene.project / output)
+    shutil.rmtree(scene.project / ".tacpipe/records")
+    words = ["xargs", "-P", "8", "-L", "1", sys.executable, "-m", "tacpipe"]
+    variables = {**os.environ, **scene.environment}
+    subprocess.run(words, input="\n".join(CHAIN), cwd=scene.project, env=variables, text=True, check=True)
+    assert [(scene.project / output / "manifest.json").read_bytes() for output in outputs] == expected
+    tidy(Store(scene.project / ".tacpipe"))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("size", CROWDS)
 def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_collected(

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tacpipe.testing import byte_faults
 from tests.promises import decoding
 from tests.promises.counts import count
 from tests.promises.limits import bound_memory
 from tests.promises.mutations import inputs
-from tests.sensors import harm
 from tests.sensors.test_every_sensor import CASES
 
 FEW, MANY = 4, 100  # inputs of a sensor
@@ -45,7 +45,7 @@ def test_bytes_changed_in_many_ways_give_the_same_samples_however_they_are_cut(c
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("case", [case for case in CASES if harm.is_stream(decoding.sensor(case))])
+@pytest.mark.parametrize("case", [case for case in CASES if byte_faults.is_byte_stream(decoding.sensor(case))])
 @pytest.mark.parametrize("kind", ["noise", "markers", "zeros", "beginnings"])
 def test_garbage_without_end_is_not_kept(case: str, kind: str) -> None:
     random = Random(0)

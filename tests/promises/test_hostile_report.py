@@ -110,10 +110,10 @@ RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # resul
             material_fakes.result("raec", wrong={"biotac": 2, "roboskin": 1}, epochs=2),
             material_fakes.recorded(),
         ],
-        ("moved at 12 mm/s", "segment.slides", "cd" * 32),
+        ("segment.slides", "cd" * 32),
     ),
     "touch": (
-        lambda: [touch_fakes.result("strong", novel=("drill",)), touch_fakes.recorded()],
+        lambda: [touch_fakes.result("strong", novel=("drill",))],
         ("bleach", "drill", "segment.grasps"),
     ),
     "of another task": (

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
+from tests.emulation.emulator import Emulator
 from tests.recording import force_rig, live, patient
 from tests.recording.scripted import Script
 

@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import tacpipe
-from tacpipe.cli.sensors import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation import ledger as ledgers
-from tacpipe.simulation.emulation.emulator import Emulator
+from tests.emulation import ledger as ledgers
+from tests.emulation.emulator import SWITCH_S, Emulator
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]

@@ -13,10 +13,10 @@ import numpy as np
 
 import tacpipe
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation.byte_faults import Faults
-from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.ledger import STAMPS
-from tests.simulation.emulation.rigs import awaited
+from tests.emulation.byte_faults import Faults
+from tests.emulation.emulator import Emulator
+from tests.emulation.ledger import STAMPS
+from tests.emulation.rigs import awaited
 
 __all__ = ["awaited"]
 ROOT = Path(__file__).parents[2]

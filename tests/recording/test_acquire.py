@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tacpipe.recording import rig as rig_of
-from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab, tacpipe
+from tests.emulation.emulator import Emulator
 from tests.recording import killing, live
 from tests.test_imports import imported
 

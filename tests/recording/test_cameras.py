@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from tacpipe.recording.station import LOST, OPENED
-from tacpipe.simulation.emulation.byte_faults import Faults
-from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.video.decoding import read_frames
 from tacpipe.video.stream import read_format
 from tests.conftest import Lab
+from tests.emulation.byte_faults import Faults
+from tests.emulation.emulator import Emulator
 from tests.recording import live
 from tests.recording.test_unplugging import end_recording, enough, plug
 from tests.video import videos

@@ -18,6 +18,7 @@ from tacpipe.plugins import registry
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import sealing
 from tacpipe.recording.spool import Spool, Spooled
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.signals.clocks import fit_clock, host_times
 from tests.sensors import made
@@ -61,7 +62,7 @@ class Recorded:
             block = made.select_rows(base, slice(0, count))
             counter = None if sensor.counter is None else numbers[rows] * sensor.step % sensor.counter
             block = replace(block, seq=counter, t_device_ns=clock_ns[rows])
-            arrivals = zip(arrival_ns[rows].tolist(), made.pieces(sensor, sensor.encode(block)), strict=True)
+            arrivals = zip(arrival_ns[rows].tolist(), split_frames(sensor, sensor.encode(block)), strict=True)
             received = [(t_ns, data) for t_ns, data in arrivals if not LOST_S[0] * 1e9 <= t_ns < LOST_S[1] * 1e9]
             spool.append("device", Chunks.from_pairs(received))
         spool.close()

@@ -16,8 +16,8 @@ import pytest
 
 from tacpipe.io.termination import TWICE_S
 from tacpipe.recording import sealing
-from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab, without_created_store
+from tests.emulation.emulator import Emulator
 from tests.recording import live
 
 Interrupt = Callable[..., None]

@@ -15,17 +15,19 @@ from tacpipe.recording.losses import CLOCK, ESTIMATED, SILENT, ClockGaps, Stream
 from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.recording.rig import RigStream
 from tacpipe.sensors.anyskin import AnySkin
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples, Sensor
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.ur_rtde import UrRtde
-from tacpipe.simulation.emulation.byte_faults import Faults, SentItem
-from tacpipe.simulation.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator
-from tacpipe.simulation.emulation.transmission import FramePace, TransmissionPlan
+from tacpipe.testing import byte_faults
 from tests.conftest import Lab
+from tests.emulation.byte_faults import Faults, SentItem
+from tests.emulation.emulator import DEFAULT_HZ, PACKETS, Emulator
+from tests.emulation.transmission import FramePace, TransmissionPlan
 from tests.recording import live
-from tests.sensors import harm, made
+from tests.sensors import made
 from tests.signals import deliveries
 from tests.signals.deliveries import Delivery
 
@@ -50,7 +52,7 @@ def all_frames(sensor: Sensor, kind: str) -> list[bytes]:
     """Return the frames of a minute."""
     samples = made.samples(kind, sensor, 60 * RATE_HZ)
     stamps = np.arange(len(samples)) * 1_000_000_000 // RATE_HZ
-    return made.pieces(sensor, sensor.encode(Samples(samples.values, samples.seq, stamps, rows=samples.rows)))
+    return split_frames(sensor, sensor.encode(Samples(samples.values, samples.seq, stamps, rows=samples.rows)))
 
 
 def read(
@@ -307,5 +309,5 @@ def test_no_sensor_loses_what_an_emulated_link_delivers_late(name: str, delivery
 
 def chunks_of(item: SentItem, stream: RigStream) -> list[tuple[int, bytes]]:
     """Return an item as a link delivers it."""
-    pieces = harm.packets(stream.sensor, item.data) if stream.address.scheme == "can" else [item.data]
+    pieces = byte_faults.packets_of(stream.sensor, item.data) if stream.address.scheme == "can" else [item.data]
     return [(item.due_ns, piece) for piece in pieces]

@@ -19,9 +19,9 @@ from tacpipe.recording.sealing import seal
 from tacpipe.recording.spool import Spool, Spooled
 from tacpipe.recording.spool_folders import RecordingHeader
 from tacpipe.sensors.framing import Chunks
-from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.store import store as store_of
 from tests.conftest import Lab, without_created_store
+from tests.emulation.emulator import Emulator
 from tests.promises import counts
 from tests.recording import killing, live
 from tests.recording.test_reading import SENSOR, frames

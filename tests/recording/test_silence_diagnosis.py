@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab, without_created_store
+from tests.emulation.emulator import Emulator
 from tests.recording import live
 
 pytestmark = pytest.mark.rig

@@ -18,6 +18,7 @@ from tacpipe.recording.rig import Rig
 from tacpipe.recording.sealing import Sealed
 from tacpipe.recording.spool import Spool, Spooled, StreamNote
 from tacpipe.recording.station import READ_S, Station
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.sensor import LocalAddress
 from tests.conftest import Lab
 from tests.recording import live
@@ -181,7 +182,7 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
     rows = np.arange(9000)
     samples = made.samples("contactile", sensor, len(rows))
     samples = type(samples)(samples.values, seq=rows, t_device_ns=rows * MS)
-    sent = made.pieces(sensor, sensor.encode(samples))
+    sent = split_frames(sensor, sensor.encode(samples))
     # the fastest arrivals are those of a recorder that was starved all through the second half, but for moments
     device = Device(monkeypatch, sent, dict.fromkeys(range(1000, 8600, 310), 300))
     table = record(tmp_path, device, rig).table

@@ -12,9 +12,9 @@ import threading
 import pytest
 
 from tacpipe.recording import triggers
-from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.network import free_port
 from tests.conftest import Lab
+from tests.emulation.emulator import Emulator
 from tests.recording import live
 
 REST, TOUCHED = 100, 1000  # counts

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tacpipe.recording.station import LOST, OPENED
-from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab, without_created_store
+from tests.emulation.emulator import Emulator
 from tests.recording import live
 
 

@@ -63,8 +63,6 @@
       const out = Math.max(frame.left - one.left, one.right - frame.right, frame.top - one.top, one.bottom - frame.bottom);
       if (out > SLACK) found.add(`outside its figure (${label}) by ${out.toFixed(0)} px: ${one.text}`);
     }
-    // names of materials stand where their latents lie, and electrodes where they are, also together
-    if (/latents of both|electrode|predicted:/.test(label)) continue;
     for (let i = 0; i < boxes.length; i++) {
       for (let j = i + 1; j < boxes.length; j++) {
         const [a, b] = [boxes[i], boxes[j]];

@@ -7,12 +7,12 @@ from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method, grouped, report_on
 from tacpipe.report import sections
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Section, SmallPrint, Table
-from tacpipe.report.context import Context
+from tacpipe.report.context import Context, TaskReport
 
 
 def section(task: str, *results: Any, others: Sequence[Any] = (), traces: int = 0) -> Section:
     """The section that a page has of results of one task."""
-    return sections.section(report_on(task), results, others, traces)
+    return sections.section(report_on(task, TaskReport), results, others, traces)
 
 
 def methods(task: str, *results: Any) -> list[Method]:
@@ -22,7 +22,7 @@ def methods(task: str, *results: Any) -> list[Method]:
 
 def context(task: str, *results: Any) -> Context:
     """The results of one task, compared."""
-    task_report = report_on(task)
+    task_report = report_on(task, TaskReport)
     runs = task_report.read(results)
     method_list = grouped(runs, task_report.usual)
     return Context(task_report, method_list, engine.comparisons(task_report, method_list), runs=runs)

@@ -1,11 +1,14 @@
 """Charts as specifications: their numbers, colours and ends."""
 
+import itertools
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tacpipe.report import charts, context
+from tacpipe.report import charts
 from tacpipe.report.charts import Curve, Dot
 
 
@@ -17,15 +20,12 @@ def ranking(*dots: Dot) -> tuple[list[dict[str, Any]], list[float]]:
 def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
     specs = [
         charts.lines([Curve("a", [0, 1], [np.nan, 2.0], [0.0, np.nan], [1.0, 3.0])], "x", "y", level=("zero", 0.0)),
-        charts.lines([Curve("a", [1, 2], [0.1, 0.2]), Curve("a", [1, 2], [0.1, 0.3], thin=True)], "x", "y", log=True),
+        charts.lines([Curve("a", [1, 2], [0.1, 0.2]), Curve("b", [1, 2], [0.1, 0.3])], "x", "y", log=True),
+        charts.lines([Curve("a", [1, 2], [np.nan, -5.0], [np.nan, -6.0], [np.nan, 0.5])], "x", "y", floor=-1.0),
         charts.lines([Curve("a", [0, 1], [0.2, 0.9])], "x", "y", diagonal=(0, 1)),
-        charts.marked([("a", 0.5, np.nan)], "x", "y"),
         charts.ranking([Dot("a", 0.5, np.nan, np.nan), Dot("b", np.nan, np.nan, np.nan)], "x"),
         charts.scatter([{"x": 1.0, "y": 2.0, "name": "a"}], "x", "y", diagonal=True, level=("c", np.nan)),
         charts.matrix(np.array([[3, 1], [0, 4]]), ["a", "b"], "true", "named"),
-        charts.bars({"1": 60.0, "2": 40.0}, "component", "%", marked=1),
-        charts.grid(np.array([[2.0, -0.5], [-0.5, 0.0]]), "latent"),
-        charts.plane([{"panel": "p", "x": 0.0, "y": 1.0, "strength": 0.5, "text": "1"}], ["p"], size=9),
     ]
     for spec in specs:
         assert json.loads(json.dumps(spec, allow_nan=False)) == spec
@@ -51,13 +51,6 @@ def test_one_method_that_is_far_off_does_not_press_the_others_together() -> None
     assert all(row["off"] == "" for row in rows if row["name"] != "far")
 
 
-def test_a_chart_of_skill_ends_at_its_floor() -> None:
-    spec: Any = charts.lines(
-        [Curve("far", [1, 2], [-1000.0, -500.0]), Curve("near", [1, 2], [0.1, 0.2])], "x", "y", floor=-1.0
-    )
-    assert spec["layer"][-1]["encoding"]["y"]["scale"]["domain"] == [-1.0, 0.2]
-
-
 def test_a_long_line_is_thinned_and_keeps_its_extremes_and_its_gaps() -> None:
     y = np.sin(np.arange(100_000) / 700)
     y[41_234], y[70_000] = 7.0, -7.0
@@ -70,13 +63,6 @@ def test_a_long_line_is_thinned_and_keeps_its_extremes_and_its_gaps() -> None:
         and min(value for value in drawn if value is not None) == -7.0
     )
     assert None in drawn
-
-
-def test_a_covariance_shows_its_sign_by_colour_and_nothing_by_none() -> None:
-    cells = charts.grid(np.array([[4.0, -1.0], [-1.0, 0.0]]), "latent")["data"]["values"]
-    assert [(cell["row"], cell["column"], cell["above"], cell["strength"]) for cell in cells] == [
-        (1, 1, True, 1.0), (1, 2, False, 0.5), (2, 1, False, 0.5)
-    ]  # fmt: skip
 
 
 def test_a_confusion_matrix_holds_its_counts() -> None:
@@ -92,16 +78,47 @@ def test_intervals_wider_than_the_differences_of_methods_are_drawn_whole() -> No
     assert {(row["low"], row["high"], row["off"]) for row in rows} == {(-0.03, 0.05, "")}
 
 
-def test_runs_are_thin_lines_and_their_mean_a_thick_one_as_long_as_the_shortest() -> None:
-    rows = context.loss_chart({"a": [[1.0, 0.5], [1.0, 0.4, 0.3]], "b": [[1.0]]}, "loss", log=True)["data"]["values"]
-    thick = [(row["name"], row["x"], row["y"]) for row in rows if not row["thin"]]
-    assert thick == [("a", 1.0, 1.0), ("a", 2.0, np.mean([0.5, 0.4])), ("b", 1.0, 1.0)]
-    assert [row["thin"] for row in rows].count(True) == 5
-
-
-def test_a_training_of_one_epoch_is_seen_as_points() -> None:
-    marks = [
-        [layer["mark"]["type"] for layer in context.loss_chart({"training": [curve]}, "loss")["layer"]]
-        for curve in ([0.5], [0.5, 0.4])
+def test_what_goes_on_below_the_floor_of_a_chart_has_an_arrow() -> None:
+    curves = [
+        Curve("far", [1, 2], [-1000.0, -500.0]),
+        Curve("wide", [1, 2], [0.1, 0.2], [-3.0, 0.1], [0.3, 0.3]),
     ]
-    assert ["circle" in layer_marks for layer_marks in marks] == [True, False]
+    spec: Any = charts.lines(curves, "x", "y", floor=-1.0)
+    assert spec["layer"][-1]["encoding"]["y"]["scale"]["domain"] == [-1.0, 0.3]
+    assert spec["layer"][-1]["mark"]["shape"] == "triangle-down"
+    arrows = [(row["name"], row["x"], row["y"], row["below"]) for row in spec["data"]["values"] if "floor" in row]
+    assert arrows == [("far", 1, None, "−1000"), ("far", 2, None, "−500"), ("wide", 1, 0.1, "0.1 (−3 to 0.3)")]
+    without: Any = charts.lines([Curve("near", [1, 2], [0.1, 0.2])], "x", "y", floor=-1.0)
+    assert without["layer"][-1]["mark"]["type"] == "circle"
+
+
+def test_an_interval_is_whole_or_has_an_arrow_where_it_goes_on() -> None:
+    near = [Dot(f"n{place}", 0.1 * place, 0.1 * place - 0.05, 0.1 * place + 0.05) for place in range(5)]
+    rows, ends = ranking(*near, Dot("wide", 0.2, -900.0, 0.3), Dot("short", 0.2, -0.4, 0.3))
+    by_name = {row["name"]: row for row in rows}
+    assert (by_name["wide"]["on_left"], by_name["wide"]["on_right"], by_name["wide"]["low"]) == (True, False, ends[0])
+    assert (by_name["short"]["on_left"], by_name["short"]["low"]) == (False, -0.4)
+    spec: Any = charts.ranking([*near, Dot("wide", 0.2, -900.0, 0.3)], "skill")
+    assert [layer["mark"]["shape"] for layer in spec["layer"][4:]] == ["triangle-left"]
+
+
+# Machado, Oliveira and Fernandes, 2009: deuteranopia in linear RGB
+DEUTERANOPIA = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
+TO_XYZ = np.array([[0.4339, 0.3762, 0.1899], [0.2127, 0.7152, 0.0722], [0.0178, 0.1095, 0.8727]])  # D65 is 1, 1, 1
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    """CIELAB of linear RGB."""
+    x, y, z = np.cbrt(np.clip(TO_XYZ @ rgb, 0.009, 1))
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def test_a_reader_without_green_cones_tells_the_colours_of_a_chart_apart() -> None:
+    css = (Path(charts.__file__).parents[1] / "templates" / "page.css").read_text()
+    colours = re.findall(r"--c\d: #(\w{6})", css)
+    assert len(colours) == 2 * 8
+    for palette in (colours[:8], colours[8:]):  # light and dark
+        linear = [(np.array([int(code[at : at + 2], 16) for at in (0, 2, 4)]) / 255) ** 2.2 for code in palette]
+        for sight in (np.eye(3), DEUTERANOPIA):
+            seen = [lab(sight @ colour) for colour in linear]
+            assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)) > 18

@@ -1,5 +1,8 @@
 """One page for results of all tasks, whole and loading nothing."""
 
+import base64
+import hashlib
+import html
 import json
 import re
 from collections.abc import Iterator
@@ -91,12 +94,10 @@ def all_results() -> list[Any]:
     wrong = {"biotac": 1, "roboskin": 2}
     return [
         result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}),
-        result_fakes.codec(8),
         material_fakes.result("minirocket", wrong=wrong),
         material_fakes.result(wrong=wrong, joint=True, epochs=3),
         material_fakes.recorded(),
         touch_fakes.result(novel=touch_fakes.NOVEL),
-        touch_fakes.recorded(),
         unknown_result("graph"),
     ]
 
@@ -186,10 +187,25 @@ def test_what_is_not_a_result_is_refused() -> None:
 
 
 def test_a_dataset_that_no_task_on_the_page_can_use_is_refused() -> None:
-    material = material_fakes.result("minirocket", wrong={"biotac": 1})
-    for result, unused in ((material, result_fakes.codec(8)), (result_fakes.result(), material_fakes.recorded())):
-        with pytest.raises(TacpipeError, match=r"no metrics\.json"):
-            page.render([result, unused], title="t")
+    with pytest.raises(TacpipeError, match=r"no metrics\.json"):
+        page.render([result_fakes.result(), material_fakes.recorded()], title="t")
+
+
+def test_the_policy_of_a_page_permits_its_own_scripts_and_style_and_nothing_else() -> None:
+    content = page.render(all_results()).decode()
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', content)
+    directives = dict(part.strip().split(" ", 1) for part in html.unescape(policy).split(";"))
+    texts = {
+        "script-src": re.findall(r"<script>(.*?)</script>", content, re.DOTALL),
+        "style-src": re.findall(r"<style>(.*?)</style>", content, re.DOTALL),
+    }
+    assert [len(found) for found in texts.values()] == [2, 1]
+    for name, found in texts.items():
+        digests = {base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in found}
+        assert set(directives.pop(name).split()) == {f"'sha256-{digest}'" for digest in digests}
+    assert directives == {
+        "default-src": "'none'", "img-src": "data:", "base-uri": "'none'", "form-action": "'none'"
+    }  # fmt: skip
 
 
 def test_text_that_looks_like_markup_stays_text() -> None:

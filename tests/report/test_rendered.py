@@ -43,20 +43,16 @@ def forward_single() -> list[Any]:
 
 
 def forward_of_long_names() -> list[Any]:
-    base = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5})
-    trials = base.files["trials.csv"].decode().replace("\nr", f"\n{LONG}-r").encode()
+    base = result_fakes.result()
+    windows = {f"{LONG}-{name}": count for name, count in result_fakes.WINDOWS.items()}
+    ratios = {"model": dict.fromkeys(windows, 0.5), "ridge": dict.fromkeys(windows, 0.75)}
     shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in base.recordings.items()}
-    return [FakeDataset(shards, {**base.files, "trials.csv": trials}, base.manifest)]
+    return [FakeDataset(shards, {**base.files, "errors.parquet": result_fakes.errors(ratios, windows)}, base.manifest)]
 
 
 def forward_many() -> list[Any]:
     ratios = (("PCA-20", 1.5), ("AE-C1-8", 1.2), ("raw", 0.5))
-    results = [result_fakes.result(name, seed, ratio=ratio) for name, ratio in ratios for seed in range(2)]
-    return [*results, result_fakes.codec(2, loss=0.75), result_fakes.codec(4, loss=0.5)]
-
-
-def forward_with_codecs() -> list[Any]:
-    return [*forward_single(), result_fakes.codec(8), result_fakes.codec(20)]
+    return [result_fakes.result(name, seed, ratio=ratio) for name, ratio in ratios for seed in range(2)]
 
 
 def material_single() -> list[Any]:
@@ -75,7 +71,7 @@ def material_many() -> list[Any]:
 
 
 def touch_single() -> list[Any]:
-    return [touch_fakes.result(novel=touch_fakes.NOVEL, baselines={"object_mean": 0.06}), touch_fakes.recorded()]
+    return [touch_fakes.result(novel=touch_fakes.NOVEL, baselines={"object_mean": 0.06})]
 
 
 def touch_many() -> list[Any]:
@@ -94,7 +90,6 @@ PAGES: dict[str, Callable[[], list[Any]]] = {
         forward_single,
         forward_of_long_names,
         forward_many,
-        forward_with_codecs,
         material_single,
         material_many,
         touch_single,
@@ -169,6 +164,24 @@ def test_tables_sort_families_unfold_and_charts_answer_the_cursor(chromium: Brow
     })()"""
     chromium.run(script)
     assert "recurrent" in chromium.run("document.getElementById('tip').textContent")
+
+
+def test_charts_are_drawn_under_the_policy_which_stops_scripts_of_others(chromium: Browser) -> None:
+    chromium.show(page.render(forward_single()), 1280)
+    chromium.run(
+        "window.refused = []; document.addEventListener('securitypolicyviolation', (event) => refused.push(event))"
+    )
+    chromium.run("showAll().then(() => true)")
+    assert chromium.run("document.querySelectorAll('.plot:not([data-ready])').length") == 0
+    assert chromium.run("refused.length") == 0
+    injected = """new Promise((done) => {
+      const script = document.createElement('script'), image = new Image();
+      script.textContent = 'window.injected = true';
+      image.src = 'https://example.org/pixel.png';
+      document.body.append(script, image);
+      setTimeout(() => done([window.injected, refused.map((event) => event.effectiveDirective).sort()]), 200);
+    })"""
+    assert chromium.run(injected) == [None, ["img-src", "script-src-elem"]]
 
 
 def test_paper_shows_what_is_folded_on_the_screen(chromium: Browser) -> None:

@@ -1,4 +1,4 @@
-"""Helpers for tests of serial drivers: bytes fed in pieces, a dialogue without a port, a pseudo-terminal with a device."""
+"""Helpers for tests of serial drivers: bytes fed in pieces, and a pseudo-terminal with a device."""
 
 import os
 import select
@@ -12,7 +12,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.sensors.framing import Chunks, FramingLoss
-from tacpipe.sensors.sensor import Device, Dialogue, Samples, Sensor
+from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.testing.dialogues import Device
 
 
 def read(sensor: Sensor, data: bytes, sizes: Sequence[int] = (50,)) -> tuple[list[Samples], list[FramingLoss]]:
@@ -45,26 +46,6 @@ def rows_of(samples: Sequence[Samples]) -> list[bytes]:
 def stream(frames: Any) -> bytes:
     """Return the bytes of frames."""
     return b"".join(bytes(frame) for frame in frames)
-
-
-def hold_dialogue(dialogue: Dialogue, device: Device, between: bytes = b"", size: int = 7) -> list[bytes]:
-    """Hold a dialogue with a device whose replies come in pieces, after ``between``; return the messages sent."""
-    sent_messages: list[bytes] = []
-    reply: bytes | None = None
-    while True:
-        try:
-            ask = dialogue.send(reply) if reply is not None else next(dialogue)
-        except StopIteration:
-            return sent_messages
-        sent_messages.append(ask.send)
-        incoming = between + b"".join(device.hear(ask.send))
-        reply = b""
-        if ask.until is not None:
-            span = next(
-                (n for stop in range(0, len(incoming) + size, size) if (n := ask.find_reply(incoming[:stop]))), None
-            )
-            assert span is not None, f"no {ask.what} among {incoming.hex(' ')}"
-            reply = incoming[slice(*span)]
 
 
 def streams(device: Device) -> bool:

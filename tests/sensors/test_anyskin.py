@@ -13,6 +13,7 @@ from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.sensor import Samples
+from tests.emulation.devices import device_for
 from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream
 
 MODES = pytest.mark.parametrize("mode", ["binary", "ascii"])
@@ -113,7 +114,7 @@ def test_ends_of_frames_among_the_numbers_that_hold_still_mislead_nobody() -> No
 def test_the_vendors_client_is_served() -> None:
     sensor, numbers = AnySkin(), random_flux(100, 6)
     frames = sensor.encode(Samples((numbers,)))
-    with served(sensor.device(), lambda number: bytes(frames[number % 100])) as port:
+    with served(device_for(sensor), lambda number: bytes(frames[number % 100])) as port:
         client = AnySkinBase(num_mags=5, port=port, temp_filtered=False)
         rows = [row[1:].astype(np.float32).tobytes() for row in client.get_data(10)]
         client.close()

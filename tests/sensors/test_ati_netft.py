@@ -12,7 +12,9 @@ from tacpipe.recording.reading import DEVICE, LINK, LinkReader
 from tacpipe.sensors.ati_netft import BIAS, START, STOP, AtiNetFT, request
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.talking import carried_out, opened
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.talking import opened
 
 
 def record(sent: int, sample_count: int, counts: tuple[int, ...] = (1, -2, 3, -4, 5, -6), status: int = 0) -> bytes:
@@ -70,7 +72,7 @@ def test_the_box_streams_once_it_was_asked_until_it_is_told_to_stop() -> None:
     sensor = AtiNetFT()
     box = opened(sensor)
     streams = box.streaming
-    carried_out(sensor.taring(), box)
+    hold_dialogue(sensor.taring(), box)
 
     assert streams and box.streaming
     box.hear(sensor.closing())
@@ -78,7 +80,7 @@ def test_the_box_streams_once_it_was_asked_until_it_is_told_to_stop() -> None:
 
 
 def test_the_box_sends_as_many_records_as_it_was_asked_for_once() -> None:
-    box = AtiNetFT().device()
+    box = device_for(AtiNetFT())
 
     box.hear(request(START, 3))
 

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from tacpipe.channels.schema import biotac_fields
 from tacpipe.errors import UsageError
 from tacpipe.sensors.biotac import BioTac, with_parity
+from tacpipe.sensors.encoding import split_frames
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
 from tests.sensors import made
 
 
@@ -41,9 +43,9 @@ def test_the_parity_is_that_of_the_published_table() -> None:
 def test_a_frame_by_hand_is_decoded_in_the_order_of_the_fields() -> None:
     electrodes, pac = list(range(101, 120)), list(range(2001, 2023))
     readings = [value for pair in zip([*electrodes, 300, 400, 500], pac, strict=True) for value in pair]
-    runs, losses = made.through(BioTac().framer(), [frame(0xFFFF, readings)])
+    runs, losses = feed_framer(BioTac().framer(), [frame(0xFFFF, readings)])
 
-    samples = made.decoded(BioTac(), runs)
+    samples = decode_runs(BioTac(), runs)
 
     values = dict(zip([field.name for field in biotac_fields()], samples.values[0][0].tolist(), strict=True))
     assert (values["pdc"], values["tac"], values["tdc"]) == (300, 400, 500)
@@ -57,7 +59,7 @@ def test_a_frame_by_hand_is_decoded_in_the_order_of_the_fields() -> None:
 def test_what_is_encoded_is_decoded(fingers: int, seed: int) -> None:
     sensor = BioTac(fingers=fingers)
     sent = made.samples("biotac", sensor, 12, seed)
-    assert made.same(sensor.decode(sensor.encode(sent)), sent)
+    assert are_equal(sensor.decode(sensor.encode(sent)), sent)
 
 
 def test_a_byte_without_odd_parity_makes_its_frame_bad_though_the_sum_is_right() -> None:
@@ -69,7 +71,7 @@ def test_a_byte_without_odd_parity_makes_its_frame_bad_though_the_sum_is_right()
     total = int(frames[2, :-2].sum())
     frames[2, -2:] = [total & 0xFF, total >> 8 & 0xFF]
 
-    runs, losses = made.through(sensor.framer(), made.pieces(sensor, frames))
+    runs, losses = feed_framer(sensor.framer(), split_frames(sensor, frames))
 
     assert sum(len(run.t_ns) for run in runs) == 4
     assert [loss.cause for loss in losses] == ["garbled"]

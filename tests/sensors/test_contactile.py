@@ -10,9 +10,13 @@ from hypothesis import strategies as st
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors import pts
 from tacpipe.sensors.contactile import Contactile
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks, FrameRun
 from tacpipe.sensors.sensor import Samples
-from tests.sensors import described, made
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 ONE = Contactile(sensors=1, pillars=1)
 BY_HAND = bytes.fromhex(
@@ -64,9 +68,9 @@ def test_a_frame_by_hand_is_decoded() -> None:
     body = BY_HAND[4:-4]
     assert sum(body[:-2]) & 0xFFFF == int.from_bytes(body[-2:], "little")
 
-    runs, losses = made.through(ONE.framer(), [BY_HAND])
+    runs, losses = feed_framer(ONE.framer(), [BY_HAND])
 
-    samples = made.decoded(ONE, runs)
+    samples = decode_runs(ONE, runs)
     assert samples.values[0].tolist() == [[1, 2, 3, 4, 5, 6, 1, 2, 3, -1, -2, -3]]
     assert samples.seq is not None and samples.seq.tolist() == [1]
     assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [1_000_000_000]
@@ -99,9 +103,9 @@ def test_tables_of_any_width_padding_and_base_are_read(
     sensor = Contactile(sensors=sensors, pillars=pillars)
     sent = frame(values.tolist(), wholes.tolist(), width=width, absolute=absolute, padding=padding)
 
-    runs, losses = made.through(sensor.framer(), [sent])
+    runs, losses = feed_framer(sensor.framer(), [sent])
 
-    samples = made.decoded(sensor, runs)
+    samples = decode_runs(sensor, runs)
     assert samples.values[0].tolist() == [[*values.ravel().tolist(), *wholes.ravel().tolist()]]
     assert samples.seq is not None and samples.seq.tolist() == [77] and losses == []
 
@@ -111,7 +115,7 @@ def test_tables_of_any_width_padding_and_base_are_read(
 def test_what_is_encoded_is_decoded(slip: bool, seed: int) -> None:
     sensor = Contactile(slip=slip)
     sent = made.samples("contactile", sensor, 6, seed)
-    assert made.same(sensor.decode(sensor.encode(sent)), sent)
+    assert are_equal(sensor.decode(sensor.encode(sent)), sent)
 
 
 def test_the_blocks_of_slip_stand_where_the_protocol_says() -> None:
@@ -129,12 +133,12 @@ def test_the_blocks_of_slip_stand_where_the_protocol_says() -> None:
 
 def test_before_the_watch_for_slip_began_have_no_sample() -> None:
     plain, watched = Contactile(), Contactile(slip=True)
-    before = made.pieces(plain, plain.encode(made.samples("contactile", plain, 4)))
+    before = split_frames(plain, plain.encode(made.samples("contactile", plain, 4)))
     sent = made.samples("contactile", watched, 3)
 
-    runs, losses = made.through(watched.framer(), [*before, *made.pieces(watched, watched.encode(sent))])
+    runs, losses = feed_framer(watched.framer(), [*before, *split_frames(watched, watched.encode(sent))])
 
-    assert len(made.decoded(watched, runs)) in (
+    assert len(decode_runs(watched, runs)) in (
         3,
         0,
     )  # 0: the counter's jump between the two is taken for a new session
@@ -143,7 +147,7 @@ def test_before_the_watch_for_slip_began_have_no_sample() -> None:
 
 
 def test_a_controller_with_other_sensors_is_named() -> None:
-    runs, _ = made.through(ONE.framer(), [BY_HAND])
+    runs, _ = feed_framer(ONE.framer(), [BY_HAND])
     with pytest.raises(DeviceError, match=r"sensors with 1 pillars.*2 with 9"):
         Contactile().decode(runs[0].frames)
 
@@ -176,11 +180,11 @@ def test_frames_of_two_layouts_in_one_batch_are_told_apart() -> None:
 def session(first: int, count: int) -> list[bytes]:
     sent = made.samples("contactile", ONE, count)
     numbered = Samples(sent.values, np.arange(first, first + count), sent.t_device_ns)
-    return made.pieces(ONE, ONE.encode(numbered))
+    return split_frames(ONE, ONE.encode(numbered))
 
 
 def counters(runs: list[FrameRun]) -> list[int]:
-    seq = made.decoded(ONE, runs).seq
+    seq = decode_runs(ONE, runs).seq
     return [] if seq is None else seq.tolist()
 
 
@@ -212,16 +216,16 @@ def test_without_a_jump_nothing_is_thrown_away_and_later_jumps_are_left_to_the_c
 
 
 def test_a_short_recording_is_given_out_at_its_end() -> None:
-    runs, losses = made.through(ONE.framer(), session(7, 3))
+    runs, losses = feed_framer(ONE.framer(), session(7, 3))
     assert counters(runs) == [7, 8, 9] and losses == []
 
 
 def test_the_device_takes_the_rate_of_the_opening() -> None:
-    device = Contactile(rate_hz=250).device()
-    assert described.hold(Contactile(rate_hz=250).opening({}), device) == [b"f250\n", b"s\n"]
+    device = device_for(Contactile(rate_hz=250))
+    assert hold_dialogue(Contactile(rate_hz=250).opening({}), device).sent == [b"f250\n", b"s\n"]
     assert device.rate_hz == 250 and device.streaming
-    assert described.hold(Contactile(slip=True).opening({}), device)[1] == b"S\n"
-    assert described.hold(Contactile().taring(), device) == [b"z\n"]
+    assert hold_dialogue(Contactile(slip=True).opening({}), device).sent[1] == b"S\n"
+    assert hold_dialogue(Contactile().taring(), device).sent == [b"z\n"]
 
 
 def test_a_rate_that_the_controller_does_not_know_is_refused() -> None:

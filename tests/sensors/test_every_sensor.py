@@ -2,8 +2,6 @@
 
 import itertools
 import re
-from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,14 @@ import pytest
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
-from tacpipe.sensors.byte_framer import LineFramer, TextFramer
-from tacpipe.sensors.framing import Chunks, FrameRun
-from tacpipe.sensors.sensor import Frames, Samples, Sensor
-from tacpipe.sensors.spacemouse import StateFramer
-from tests.sensors import described, harm, made
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+from tacpipe.testing import byte_faults
+from tacpipe.testing.contract import SentFrames, check_clean_frames, check_faults, check_round_trip, encode_samples
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import decode_runs, feed_framer, rows_as_bytes
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 KINDS = list(registry.sensors())
 SIZE = {"width_px": 320, "height_px": 240, "pixel_format": "yuvj422p"}
@@ -77,34 +78,10 @@ UNSEEN_AT_MOST = {  # faults of a hundred that sums do not see: none with 16 bit
 }
 
 
-@dataclass(frozen=True)
-class Sent:
-    """Frames of a sensor as they left the device, and what each says."""
-
-    sensor: Sensor
-    samples: Samples
-    frames: Frames
-    pieces: list[bytes]
-    numbers: dict[bytes, int]  # the number of each sample by its `made.rows`
-
-
-def sent(case: str, count: int, seed: int = 0) -> Sent:
+def sent(case: str, count: int, seed: int = 0) -> SentFrames:
     kind, options = CASES[case]
     sensor = rig.build_sensor(kind, options, case)
-    samples = made.samples(kind, sensor, count, seed)
-    frames = sensor.encode(samples)
-    rows = made.rows(understood(sensor, frames))
-    numbers = {row: number for number, row in enumerate(rows)}
-    assert len(numbers) == len(rows) == count, "two samples are the same, and cannot be distinguished"
-    return Sent(sensor, samples, frames, made.pieces(sensor, frames), numbers)
-
-
-def understood(sensor: Sensor, frames: Frames) -> Samples:
-    """Return what frames say as `Sensor.encode` gave them: binary ones of several sizes one by one."""
-    if isinstance(frames, np.ndarray) or isinstance(sensor.framer(), TextFramer | LineFramer | StateFramer):
-        return sensor.decode(frames)
-    runs = [FrameRun(np.frombuffer(frame, np.uint8)[None], np.zeros(1, dtype=np.int64)) for frame in frames]
-    return made.decoded(sensor, runs)
+    return encode_samples(sensor, made.samples(kind, sensor, count, seed))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -127,84 +104,40 @@ def test_fields_have_names_of_their_own_units_and_quantities(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_decoded_blocks_are_the_fields_side_by_side_in_their_types(case: str) -> None:
-    recorded = sent(case, 40)
-    values = understood(recorded.sensor, recorded.frames).values
-    kinds = [block.dtype for block in values for _ in range(block.shape[1])]
-    assert kinds == [np.dtype(field.type.to_pandas_dtype()) for field in recorded.sensor.fields()]
-    assert {len(block) for block in values} == {40}
-
-
-@pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("seed", range(3))
-def test_what_is_encoded_is_decoded(case: str, seed: int) -> None:
-    recorded = sent(case, 60, seed)
-    decoded = understood(recorded.sensor, recorded.frames)
-    assert made.same(decoded, recorded.samples) or (
-        CASES[case][0] in made.ROUNDED and made.nearly_equal(recorded.sensor, decoded, recorded.samples)
-    )
-    assert (decoded.seq is None) == (recorded.sensor.counter is None)
-    assert (decoded.device_seq is None) == (recorded.sensor.device_counter is None)
+def test_what_is_encoded_is_decoded_in_the_types_of_the_fields(case: str, seed: int) -> None:
+    check_round_trip(sent(case, 60, seed), is_rounded=CASES[case][0] in made.ROUNDED)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_clean_frames_come_through_but_for_the_first(case: str) -> None:
-    recorded = sent(case, 200)
-    chunks = harm.sent(recorded.sensor, recorded.pieces, [], np.random.default_rng(1))
-    framer = recorded.sensor.framer()
-
-    runs, losses = made.through(framer, chunks)
-
-    numbers = [recorded.numbers[row] for row in made.rows(made.decoded(recorded.sensor, runs))]
-    assert numbers == list(range(numbers[0], 200)) and len(numbers) >= 199
-    assert framer.account.lost == sum(loss.bytes for loss in losses)
-    assert framer.account.pending == 0
-    assert {loss.cause for loss in losses} <= {"start"}
+    check_clean_frames(sent(case, 200))
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_fault_gives_a_sample_that_nobody_sent_and_none_is_lost_unsaid(case: str) -> None:
-    recorded = sent(case, COUNT)
-    rng = np.random.default_rng(0)
-    faults = list(harm.harms(recorded.sensor, recorded.pieces, rng))
-    framer = recorded.sensor.framer()
+    undetectable = check_faults(sent(case, COUNT))
 
-    runs, losses = made.through(framer, harm.sent(recorded.sensor, recorded.pieces, faults, rng))
-
-    outcomes = [harm.outcome(recorded.sensor, recorded.pieces, fault) for fault in faults]
-    rows = made.rows(made.decoded(recorded.sensor, runs))
-    numbers = [recorded.numbers[row] for row in rows if row in recorded.numbers]
-    unseen = Counter(fault.fault for fault, result in zip(faults, outcomes, strict=True) if result.other)
-    assert {row for row in rows if row not in recorded.numbers} <= {row for result in outcomes for row in result.other}
-    assert sum(unseen.values()) <= UNSEEN_AT_MOST.get(CASES[case][0], len(faults))
-    assert numbers == sorted(set(numbers))
-    assert framer.account.received == framer.account.framed + framer.account.lost
-    assert framer.account.lost == sum(loss.bytes for loss in losses)
-    silent = [
-        (fault.row, fault.fault)
-        for fault, result in zip(faults, outcomes, strict=True)
-        if result.missing and not result.other and not result.told and fault.fault != harm.LOST
-    ]
-    assert silent == []
+    assert undetectable <= UNSEEN_AT_MOST.get(CASES[case][0], COUNT)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_frames_are_found_again_within_two(case: str) -> None:
     recorded = sent(case, COUNT)
     rng = np.random.default_rng(2)
-    faults = list(harm.harms(recorded.sensor, recorded.pieces, rng))
+    faults = list(byte_faults.draw_faults(recorded.sensor, recorded.frames, rng))
 
-    runs, _ = made.through(recorded.sensor.framer(), harm.sent(recorded.sensor, recorded.pieces, faults, rng))
+    runs, _ = feed_framer(recorded.sensor.framer(), byte_faults.deliver(recorded.sensor, recorded.frames, faults, rng))
 
-    numbers = {recorded.numbers.get(row) for row in made.rows(made.decoded(recorded.sensor, runs))}
+    numbers = {recorded.numbers.get(row) for row in rows_as_bytes(decode_runs(recorded.sensor, runs))}
     ends = [*(fault.row for fault in faults[1:]), COUNT - 1]
     late = [
-        (fault.row, fault.fault)
+        (fault.row, fault.kind)
         for fault, end in zip(faults, ends, strict=True)
         if not numbers.issuperset(range(fault.row + FOUND_AGAIN, end - 1))
-        and not harm.outcome(
-            recorded.sensor, recorded.pieces, fault
-        ).other  # one that no check sees may last, as a state does
+        and not byte_faults.outcome_of(
+            recorded.sensor, recorded.frames, fault
+        ).invented  # one that no check sees may last, as a state does
     ]
     assert late == []
 
@@ -213,11 +146,13 @@ def test_frames_are_found_again_within_two(case: str) -> None:
 def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: str) -> None:
     recorded = sent(case, 100)
     rng = np.random.default_rng(3)
-    chunks = harm.sent(recorded.sensor, recorded.pieces, list(harm.harms(recorded.sensor, recorded.pieces, rng)), rng)
+    chunks = byte_faults.deliver(
+        recorded.sensor, recorded.frames, list(byte_faults.draw_faults(recorded.sensor, recorded.frames, rng)), rng
+    )
 
-    results = [made.through(recorded.sensor.framer(), chunks, at_once=at_once)[0] for at_once in (1, 7, 1000)]
+    results = [feed_framer(recorded.sensor.framer(), chunks, at_once=at_once)[0] for at_once in (1, 7, 1000)]
 
-    rows = [made.rows(made.decoded(recorded.sensor, runs)) for runs in results]
+    rows = [rows_as_bytes(decode_runs(recorded.sensor, runs)) for runs in results]
     assert rows[0] == rows[1] == rows[2]
     stamps = [np.concatenate([run.t_ns for run in runs]).tolist() for runs in results]
     assert stamps[0] == stamps[1] == stamps[2]
@@ -227,20 +162,22 @@ def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: st
 @pytest.mark.parametrize("is_harmed", [False, True])
 def test_rows_are_the_same_however_reads_cut_the_bytes(case: str, is_harmed: bool) -> None:
     recorded = sent(case, 300)
-    if not harm.is_stream(recorded.sensor):
+    if not byte_faults.is_byte_stream(recorded.sensor):
         pytest.skip("packets are never cut")
-    faults = list(harm.harms(recorded.sensor, recorded.pieces, np.random.default_rng(4))) if is_harmed else []
-    whole = b"".join(harm.sent(recorded.sensor, recorded.pieces, faults, np.random.default_rng(5)))
+    faults = (
+        list(byte_faults.draw_faults(recorded.sensor, recorded.frames, np.random.default_rng(4))) if is_harmed else []
+    )
+    whole = b"".join(byte_faults.deliver(recorded.sensor, recorded.frames, faults, np.random.default_rng(5)))
     size = len(whole) // 300
-    expected = made.rows(made.decoded(recorded.sensor, made.through(recorded.sensor.framer(), [whole])[0]))
+    expected = rows_as_bytes(decode_runs(recorded.sensor, feed_framer(recorded.sensor.framer(), [whole])[0]))
 
     for mean in (1, size // 3 + 2, size, 3 * size):
         stops = np.cumsum(np.random.default_rng(mean).integers(1, 2 * mean + 1, len(whole)))
         edges = [0, *stops[stops < len(whole)].tolist(), len(whole)]
         chunks = [whole[start:stop] for start, stop in itertools.pairwise(edges)]
         for at_once in (1, 64):
-            runs, _ = made.through(recorded.sensor.framer(), chunks, at_once=at_once)
-            assert made.rows(made.decoded(recorded.sensor, runs)) == expected
+            runs, _ = feed_framer(recorded.sensor.framer(), chunks, at_once=at_once)
+            assert rows_as_bytes(decode_runs(recorded.sensor, runs)) == expected
 
 
 MARKED = {"rate_hz": 100, "marker": "AA 55", "numbers": [{"name": "taxel", "type": "u16", "count": 4}]}
@@ -259,12 +196,11 @@ def waits_for_the_next(kind: str, options: dict[str, Any], *, datagrams: bool = 
     """Return whether a frame gives its sample only when the next frame arrives."""
     sensor = rig.build_sensor(kind, options, kind)
     object.__setattr__(sensor, "datagrams", datagrams)
-    frames = sensor.encode(made.samples(kind, sensor, 40))
-    numbers = {row: number for number, row in enumerate(made.rows(understood(sensor, frames)))}
-    framer, waits = sensor.framer(), []
-    for number, piece in enumerate(made.pieces(sensor, frames)):
-        packets = [(number * 100_000_000, packet) for packet in harm.packets(sensor, piece)]
-        rows = made.rows(made.decoded(sensor, framer.feed(Chunks.from_pairs(packets))[0]))
+    recorded = encode_samples(sensor, made.samples(kind, sensor, 40))
+    numbers, framer, waits = recorded.numbers, sensor.framer(), []
+    for number, piece in enumerate(recorded.frames):
+        packets = [(number * 100_000_000, packet) for packet in byte_faults.packets_of(sensor, piece)]
+        rows = rows_as_bytes(decode_runs(sensor, framer.feed(Chunks.from_pairs(packets))[0]))
         waits.append(number not in {numbers[row] for row in rows})
     assert len(set(waits[20:])) == 1
     return waits[-1]
@@ -288,11 +224,11 @@ def test_a_tail_or_the_end_of_a_datagram_releases_a_frame_at_once() -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_the_device_answers_what_the_host_says_and_then_gives_frames(case: str) -> None:
     sensor = rig.build_sensor(*CASES[case], case)
-    device = sensor.device()
+    device = device_for(sensor)
 
-    described.hold(sensor.opening({"port": 50_000}), device)
+    hold_dialogue(sensor.opening({"port": 50_000}), device)
     device.hear(sensor.request())
 
     assert device.streaming or device.polled() > 0
-    described.hold(sensor.taring(), device)
+    hold_dialogue(sensor.taring(), device)
     device.hear(sensor.closing())

@@ -10,6 +10,7 @@ from tacpipe.arrays import Bytes
 from tacpipe.errors import UsageError
 from tacpipe.sensors.flexitac import FlexiTac
 from tacpipe.sensors.sensor import Samples
+from tests.emulation.devices import device_for
 from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream
 
 SMALL = FlexiTac(rows=4, columns=5)
@@ -84,7 +85,7 @@ def test_the_vendors_client_is_served() -> None:
     taxels = random_taxels(sensor, 200, 3)
     frames = sensor.encode(Samples((taxels,)))
     with (
-        served(sensor.device(), lambda number: bytes(frames[number % 200])) as port,
+        served(device_for(sensor), lambda number: bytes(frames[number % 200])) as port,
         flexitac.FlexiTacSensor(port, rows=16, cols=16, baseline=0.0) as client,
     ):
         read_by_it = {client.read().raw.tobytes() for _ in range(10)}

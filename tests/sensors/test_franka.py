@@ -13,7 +13,9 @@ from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.franka import STATE, Franka, message_size
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.talking import carried_out, opened, reply_of
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.talking import opened, reply_of
 
 BEFORE_JOINTS = 6 * 16 + 13 + 13 + 4  # floats: six poses, end effector, load, elbows
 CONNECT = struct.pack("<IIIHH", 0, 1, 16, 10, 40123)
@@ -99,7 +101,7 @@ def test_the_arm_is_told_version_and_port_and_sends_its_state_there() -> None:
 
 
 def test_the_arms_reply_is_that_of_the_interface_however_the_request_is_cut() -> None:
-    arm = Franka().device()
+    arm = device_for(Franka())
 
     replies = [reply for place in range(len(CONNECT)) for reply in arm.hear(CONNECT[place : place + 1])]
 
@@ -124,13 +126,13 @@ def test_a_robot_that_refuses_or_is_none_is_told_in_a_sentence(reply: bytes, sen
 
 
 def test_an_older_library_is_told_the_arms_version() -> None:
-    arm = Franka().device()
+    arm = device_for(Franka())
 
     assert arm.hear(struct.pack("<IIIHH", 0, 1, 16, 5, 4000)) == [struct.pack("<IIIHHI", 0, 1, 20, 1, 10, 0)]
     assert not arm.streaming
     with pytest.raises(DeviceError, match="0 bytes"):
         message_size(bytes(12))
-    assert carried_out(Franka().taring(), arm) == b""
+    assert hold_dialogue(Franka().taring(), arm).unclaimed == b""
 
 
 @settings(deadline=None)

@@ -17,7 +17,9 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.generic import Generic
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import hold_dialogue, read, rows_of, stream, streams, values
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import read, rows_of, stream, streams, values
 
 BOARD = """
 [[stream]]
@@ -230,14 +232,18 @@ def test_each_packet_is_a_frame_where_the_link_has_packets() -> None:
 
 def test_a_board_is_started_and_stopped_where_the_file_says_how() -> None:
     sensor = board(numbers=[{"name": "v", "type": "u16"}], start="67 6F 0A", stop="0A 6F 67")
-    device = sensor.device()
+    device = device_for(sensor)
     assert not streams(device)
-    assert hold_dialogue(sensor.opening({}), device) == [b"go\n"] and streams(device)
+    assert hold_dialogue(sensor.opening({}), device).sent == [b"go\n"] and streams(device)
     device.hear(sensor.closing()[:2])
     device.hear(sensor.closing()[2:])
     assert not streams(device)
     silent = board(numbers=[{"name": "v", "type": "u16"}])
-    assert not hold_dialogue(silent.opening({}), silent.device()) and streams(silent.device()) and not silent.closing()
+    assert (
+        not hold_dialogue(silent.opening({}), device_for(silent)).sent
+        and streams(device_for(silent))
+        and not silent.closing()
+    )
 
 
 V = {"name": "v", "type": "u16"}

@@ -8,7 +8,10 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Chunks, FrameRun, FramingLoss
 from tacpipe.sensors.icub_skin import CAN, IcubSkin, can_frame
-from tests.sensors import described, made
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 PATCH = IcubSkin(board=9, triangles=(0, 1, 5))
 MS = 1_000_000
@@ -52,9 +55,9 @@ def feed_in_batches(
 
 
 def test_a_scan_by_hand_is_decoded() -> None:
-    runs, losses = made.through(PATCH.framer(), SCAN)
+    runs, losses = feed_framer(PATCH.framer(), SCAN)
 
-    taxels, diagnostics = made.decoded(PATCH, runs).values
+    taxels, diagnostics = decode_runs(PATCH, runs).values
 
     expected = [*range(0xF0, 0xE4, -1), *range(0x01, 0x0D), *range(0x11, 0x1D)]
     assert taxels.tolist() == [expected]
@@ -65,9 +68,9 @@ def test_a_scan_by_hand_is_decoded() -> None:
 
 def test_a_scan_without_diagnostics_reads_none() -> None:
     short = [data[:4] + b"\x06" + data[5:11] + b"\0\0" if data[5] == 0xC0 else data for data in SCAN]
-    runs, losses = made.through(PATCH.framer(), short)
+    runs, losses = feed_framer(PATCH.framer(), short)
 
-    assert made.decoded(PATCH, runs).values[1].tolist() == [[0, 0, 0]]
+    assert decode_runs(PATCH, runs).values[1].tolist() == [[0, 0, 0]]
     assert losses == []
 
 
@@ -84,7 +87,7 @@ def test_fields_name_triangle_and_taxel_and_mark_the_thermal_ones() -> None:
 def test_what_is_encoded_is_decoded(old: bool, seed: int) -> None:
     sensor = IcubSkin(old=old)
     sent = made.samples("icub-skin", sensor, 5, seed)
-    assert made.same(sensor.decode(sensor.encode(sent)), sent)
+    assert are_equal(sensor.decode(sensor.encode(sent)), sent)
 
 
 @given(at_once=st.integers(1, 40), first=st.integers(0, 5))
@@ -174,9 +177,9 @@ def test_several_can_frames_of_one_adapter_s_packet_are_taken_one_by_one() -> No
 
 def test_the_board_is_told_what_the_published_driver_tells_it() -> None:
     sensor = IcubSkin(board=9)
-    device = sensor.device()
+    device = device_for(sensor)
 
-    messages = described.hold(sensor.opening({}), device)
+    messages = hold_dialogue(sensor.opening({}), device).sent
 
     assert messages == [
         can_frame(0x209, bytes.fromhex("4D 00 14 F0")),  # type 0, 20 ms, no load 240
@@ -190,9 +193,9 @@ def test_the_board_is_told_what_the_published_driver_tells_it() -> None:
 
 def test_a_board_of_the_older_configuration_streams_once_it_is_configured() -> None:
     sensor = IcubSkin(board=9, old=True)
-    device = sensor.device()
+    device = device_for(sensor)
 
-    messages = described.hold(sensor.opening({}), device)
+    messages = hold_dialogue(sensor.opening({}), device).sent
 
     assert messages == [
         can_frame(0x209, bytes.fromhex("4C 01 01 01 00 22 00 00")),

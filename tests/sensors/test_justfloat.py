@@ -12,7 +12,9 @@ from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.sensors.justfloat import JustFloat
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import hold_dialogue, read, rows_of, stream, streams
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import read, rows_of, stream, streams
 
 FLOATS = arrays.arrays(
     np.float32,
@@ -83,9 +85,9 @@ def test_a_fulai_has_its_floats_and_leaves_out_what_is_reserved(model: str, floa
 
 def test_a_fulai_is_switched_on_and_off_and_tells_what_it_is() -> None:
     sensor = JustFloat(model="fulai-3.1")
-    device = sensor.device()
+    device = device_for(sensor)
     assert not streams(device)
-    assert hold_dialogue(sensor.opening({}), device) == [b"vofa on\r\n"]
+    assert hold_dialogue(sensor.opening({}), device).sent == [b"vofa on\r\n"]
     assert streams(device)
     (reply,) = device.hear(b"bridge in") + device.hear(b"fo get\r\n")
     assert reply.startswith(b"OK BRIDGE MODEL=") and b" HW=V3.1 " in reply and reply.endswith(b"\r\n")
@@ -94,7 +96,7 @@ def test_a_fulai_is_switched_on_and_off_and_tells_what_it_is() -> None:
 
 
 def test_any_other_board_is_told_nothing() -> None:
-    assert not hold_dialogue(ANY.opening({}), ANY.device()) and not ANY.closing() and streams(ANY.device())
+    assert not hold_dialogue(ANY.opening({}), device_for(ANY)).sent and not ANY.closing() and streams(device_for(ANY))
 
 
 @pytest.mark.parametrize(

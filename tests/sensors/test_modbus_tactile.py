@@ -13,7 +13,9 @@ from tacpipe.arrays import Counts
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.modbus_tactile import ModbusTactile, with_crc
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import FakeSerial, hold_dialogue, read, rows_of, served, stream
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream
 
 SENSOR = ModbusTactile()
 TAXELS = arrays.arrays(np.uint16, st.tuples(st.integers(1, 12), st.just(60)))
@@ -69,7 +71,7 @@ def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(seed: int, bit: i
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    taxels, device = random_taxels(50, 2), SENSOR.device()
+    taxels, device = random_taxels(50, 2), device_for(SENSOR)
     frames = SENSOR.encode(Samples((taxels,)))
     with (
         served(device, lambda number: bytes(frames[number % 50])) as port,
@@ -88,8 +90,8 @@ def test_the_vendors_client_is_served() -> None:
 
 
 def test_the_device_is_opened_tared_and_asked_though_something_else_came_first() -> None:
-    device = SENSOR.device()
-    messages = hold_dialogue(SENSOR.opening({}), device, between=b"\x01\x42\x00" + bytes(30) + b"\x01\x03\x02")
+    device = device_for(SENSOR)
+    messages = hold_dialogue(SENSOR.opening({}), device, between=b"\x01\x42\x00" + bytes(30) + b"\x01\x03\x02").sent
     assert [message[1:6].hex(" ") for message in messages] == ["06 00 0b 00 00", "03 00 0f 00 01", "06 00 0d 00 01"]
     hold_dialogue(SENSOR.taring(), device)
     device.hear(SENSOR.request()[:2])
@@ -99,7 +101,7 @@ def test_the_device_is_opened_tared_and_asked_though_something_else_came_first()
 
 def test_another_number_of_taxels_is_told() -> None:
     with pytest.raises(DeviceError, match=r"60 taxels.*48.*= 60"):
-        hold_dialogue(ModbusTactile(points=48).opening({}), SENSOR.device())
+        hold_dialogue(ModbusTactile(points=48).opening({}), device_for(SENSOR))
 
 
 def test_a_refusal_is_told() -> None:

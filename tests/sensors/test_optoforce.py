@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import FakeSerial, hold_dialogue, read, rows_of, served, stream, streams, values
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import FakeSerial, read, rows_of, served, stream, streams, values
 
 VENDORS = {3: optoforce.OptoForce16, 6: optoforce.OptoForce22, 12: optoforce.OptoForce34}
 AXES = pytest.mark.parametrize("axes", [3, 6, 12])
@@ -71,7 +73,7 @@ def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(axes: int, seed: 
 @pytest.mark.rig
 def test_the_vendors_client_is_served_and_sets_rate_and_filter() -> None:
     sensor, samples = OptoForce(axes=3), random_samples(3, 500, 2)
-    frames, device = sensor.encode(samples), sensor.device()
+    frames, device = sensor.encode(samples), device_for(sensor)
     assert not streams(device)
     with served(device, lambda number: bytes(frames[number % 500])) as port, warnings.catch_warnings():
         client = optoforce.OptoForce16(port, speed_hz=333, filter_hz=150)
@@ -84,8 +86,8 @@ def test_the_vendors_client_is_served_and_sets_rate_and_filter() -> None:
 
 def test_the_device_is_opened_tared_and_stopped() -> None:
     sensor = OptoForce(axes=6, rate_hz=1000, filter_hz=15)
-    device = sensor.device()
-    assert hold_dialogue(sensor.opening({}), device) == [bytes.fromhex("AA 00 32 03 01 04 00 00 E4")]
+    device = device_for(sensor)
+    assert hold_dialogue(sensor.opening({}), device).sent == [bytes.fromhex("AA 00 32 03 01 04 00 00 E4")]
     assert streams(device) and device.rate_hz == 1000
     hold_dialogue(sensor.taring(), device)
     device.hear(sensor.closing())

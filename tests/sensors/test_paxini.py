@@ -13,7 +13,9 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.paxini import REPLY, SLOTS, VARIANTS, Paxini, find_push_reply, message, write
 from tacpipe.sensors.paxini import read as asked
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import read, rows_of, served, stream, streams
 
 HAND = Paxini(
     modules=("thumb_tip", "index_tip", "palm1"), variants=("DP-S2015-Elite", "DP-S1813-Elite", "MC-M2020-Elite")
@@ -111,10 +113,10 @@ def test_after_a_flipped_bit_nothing_is_read_that_was_not_sent(seed: int, bit: i
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 1000), size=st.integers(30, 500))
 def test_the_board_is_opened_though_an_earlier_session_still_streams(seed: int, size: int) -> None:
-    device = HAND.device()
+    device = device_for(HAND)
     stale = stream(HAND.encode(random_samples(HAND, 3, seed)))[5:]
     stale += b"\xaa\x55\x00\x03\x10\x00\x04\x00"  # These bytes begin as a reply does.
-    messages = hold_dialogue(HAND.opening({}), device, between=stale, size=size)
+    messages = hold_dialogue(HAND.opening({}), device, between=stale, piece_bytes=size).sent
     assert [sent_bytes.hex(" ") for sent_bytes in messages] == [
         "55 aa 00 10 17 00 01 00 00 d9",
         "55 aa 00 03 00 00 0f 00 ef",
@@ -131,14 +133,14 @@ def test_the_board_is_opened_though_an_earlier_session_still_streams(seed: int, 
 def test_requests_are_those_of_the_vendor() -> None:
     assert asked(0x30, 56) == protocol.build_simple_request(protocol.FUNC_READ_SIMPLE, 0x30, data_len=56)
     assert write(0x17, b"\x01") == protocol.build_simple_request(protocol.FUNC_WRITE_SIMPLE, 0x17, data=b"\x01")
-    (sent_bytes,) = hold_dialogue(HAND.taring(), HAND.device())
+    (sent_bytes,) = hold_dialogue(HAND.taring(), device_for(HAND)).sent
     assert sent_bytes == bytes.fromhex("55AA00170200010001E6")
 
 
 def test_other_modules_than_in_the_rig_file_are_told_with_what_to_write() -> None:
     sensor = Paxini(modules=("index_tip",), variants=("DP-S2015-Elite",))
     with pytest.raises(DeviceError) as caught:
-        hold_dialogue(sensor.opening({}), HAND.device())
+        hold_dialogue(sensor.opening({}), device_for(HAND))
     assert str(caught.value) == (
         "The board (PX-HS V1.0.0) has thumb_tip of 52 points, index_tip of 31 points, palm1 of 9 points; the rig file "
         "declares "
@@ -149,7 +151,7 @@ def test_other_modules_than_in_the_rig_file_are_told_with_what_to_write() -> Non
 
 def test_a_refusal_and_a_write_without_data_are_understood() -> None:
     opening = HAND.opening({})
-    device = HAND.device()
+    device = device_for(HAND)
     asks = [next(opening)]
     while asks[-1].send[3:6] != b"\x10\x16\x00":
         asks.append(opening.send(b"".join(device.hear(asks[-1].send))))
@@ -177,7 +179,7 @@ def test_the_first_forces_that_are_pushed_are_looked_at_and_stay_a_sample() -> N
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    samples, device = random_samples(HAND, 100, 3), HAND.device()
+    samples, device = random_samples(HAND, 100, 3), device_for(HAND)
     frames = HAND.encode(samples)
     device.streaming = True  # an earlier session left it so
     with served(device, lambda number: bytes(frames[number % 100]), 0.011) as port, HighSpeedHandBoard(port) as board:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
 from tacpipe.sensors.generic import RawHid
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
 from tests.sensors import made
 
 BY_HAND = bytes.fromhex(
@@ -14,9 +15,9 @@ BY_HAND = bytes.fromhex(
 
 
 def test_a_report_by_hand_is_decoded() -> None:
-    runs, losses = made.through(RawHid().framer(), [BY_HAND])
+    runs, losses = feed_framer(RawHid().framer(), [BY_HAND])
 
-    samples = made.decoded(RawHid(), runs)
+    samples = decode_runs(RawHid(), runs)
 
     assert samples.values[0].tolist() == [[1, 515, 1023, 0, 65535, 4660, 5, 6, 7, 8, 9, 1024]]
     assert samples.seq is not None and samples.seq.tolist() == [0xBEEF]
@@ -26,7 +27,7 @@ def test_a_report_by_hand_is_decoded() -> None:
 @given(seed=st.integers(0, 1 << 30))
 def test_what_is_encoded_is_decoded(seed: int) -> None:
     sent = made.samples("rawhid", RawHid(), 30, seed)
-    assert made.same(RawHid().decode(RawHid().encode(sent)), sent)
+    assert are_equal(RawHid().decode(RawHid().encode(sent)), sent)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +36,7 @@ def test_what_is_encoded_is_decoded(seed: int) -> None:
     ids=["short", "long", "other marker", "no zero", "empty"],
 )
 def test_a_report_of_another_layout_is_malformed(report: bytes) -> None:
-    runs, losses = made.through(RawHid().framer(), [report])
+    runs, losses = feed_framer(RawHid().framer(), [report])
     assert runs == []
     assert [(loss.cause, loss.bytes) for loss in losses] == [("malformed", len(report))]
 

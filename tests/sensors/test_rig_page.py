@@ -59,7 +59,7 @@ def test_the_rig_files_are_rigs() -> None:
     texts = [block for block in blocks("toml") if "[[stream]]" in block and "pulse" not in block]
     kinds = {stream.kind for text in texts for stream in rig.parse(text).streams.values()}
 
-    assert kinds == {"xela", "ati-netft", "tap", "lsl", "lines", "generic", "anyskin", "tfmini"}
+    assert kinds == {"xela", "ati-netft", "tap", "lsl", "lines", "generic"}
 
 
 def test_three_lines_of_python_send_what_a_tap_takes() -> None:

@@ -14,7 +14,9 @@ from pyrobotiqtactile.protocol import PacketParser
 from tacpipe.errors import UsageError
 from tacpipe.sensors.robotiq import KINDS, Robotiq, command
 from tacpipe.sensors.sensor import Samples
-from tests.sensors.serial_lab import hold_dialogue, read, rows_of, served, stream, streams
+from tacpipe.testing.dialogues import hold_dialogue
+from tests.emulation.devices import device_for
+from tests.sensors.serial_lab import read, rows_of, served, stream, streams
 
 BOTH = Robotiq()
 # a dynamic 0, an acceleration 1, a temperature 0
@@ -115,7 +117,7 @@ def test_the_clock_is_time_once_its_tick_is_known() -> None:
 
 @pytest.mark.rig
 def test_the_vendors_client_is_served() -> None:
-    samples, device = random_samples(BOTH, 100, 3), BOTH.device()
+    samples, device = random_samples(BOTH, 100, 3), device_for(BOTH)
     frames = BOTH.encode(samples)
     with served(device, lambda number: bytes(frames[number % 100])) as port:
         client = RobotiqTactileSensor(serial.Serial(port, 115_200, timeout=0.5))
@@ -130,9 +132,9 @@ def test_the_vendors_client_is_served() -> None:
 
 
 def test_the_device_is_opened_and_asked() -> None:
-    device = BOTH.device()
+    device = device_for(BOTH)
     assert not streams(device)
-    assert hold_dialogue(BOTH.opening({}), device) == [bytes.fromhex("9A 00 58 01 0A")]
+    assert hold_dialogue(BOTH.opening({}), device).sent == [bytes.fromhex("9A 00 58 01 0A")]
     assert streams(device) and device.rate_hz == 100
     assert device.polled() == 0
     device.hear(bytes.fromhex("9A 00 61 00 9A 00 61 00"))

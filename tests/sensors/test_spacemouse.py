@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.spacemouse import SpaceMouse
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
 from tests.sensors import made
 
 BOTH = bytes.fromhex("01 5E01 A2FE 0000 0100 FFFF 0A00".replace(" ", ""))  # 350 -350 0, 1 -1 10
@@ -20,8 +21,8 @@ BATTERY = bytes.fromhex("17 5A")
 
 
 def rows(reports: list[bytes], at_once: int = 64) -> list[tuple[Any, ...]]:
-    runs, _ = made.through(SpaceMouse().framer(), reports, at_once=at_once)
-    samples = made.decoded(SpaceMouse(), runs)
+    runs, _ = feed_framer(SpaceMouse().framer(), reports, at_once=at_once)
+    samples = decode_runs(SpaceMouse(), runs)
     return [(*axes, *buttons) for axes, buttons in zip(*(block.tolist() for block in samples.values), strict=True)]
 
 
@@ -65,10 +66,10 @@ def test_what_is_encoded_is_decoded(split: bool, seed: int) -> None:
     sent = made.samples("spacemouse", sensor, 40, seed)
 
     reports = sensor.encode(sent)
-    runs, _ = made.through(sensor.framer(), reports)
+    runs, _ = feed_framer(sensor.framer(), reports)
 
-    assert made.same(made.decoded(sensor, runs), sent)
-    assert made.same(sensor.decode(reports), sent)
+    assert are_equal(decode_runs(sensor, runs), sent)
+    assert are_equal(sensor.decode(reports), sent)
     assert {len(report) for report in reports} == ({7, 5} if split else {13, 5})
 
 
@@ -78,7 +79,7 @@ def test_what_is_no_report_is_malformed_and_leaves_the_state(report: bytes) -> N
     runs, losses = framer.feed(Chunks.from_pairs([(1, BOTH), (2, report), (3, PRESSED)]))
 
     assert [loss.cause for loss in losses] == ["malformed"]
-    assert made.decoded(SpaceMouse(), runs).values[0].tolist() == [[350, -350, 0, 1, -1, 10]] * 2
+    assert decode_runs(SpaceMouse(), runs).values[0].tolist() == [[350, -350, 0, 1, -1, 10]] * 2
     assert runs[0].t_ns.tolist() == [1, 3]
     assert framer.account.pending == 0
 

@@ -8,7 +8,10 @@ from hypothesis import strategies as st
 from tacpipe.errors import UsageError
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.teraranger import BINARY, START, STOP, TeraRanger
-from tests.sensors import described, made
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 
 def crc8(data: bytes) -> int:
@@ -29,9 +32,9 @@ def test_the_last_byte_of_a_command_is_its_crc(command: bytes) -> None:
 def test_frames_by_hand_are_decoded_and_codes_stay() -> None:
     sensor = TeraRanger()
     frames = [b"T" + distance.to_bytes(2, "big") for distance in (1234, 0, 1, 65535, 600)]
-    runs, losses = made.through(sensor.framer(), [frame + bytes([crc8(frame)]) for frame in frames])
+    runs, losses = feed_framer(sensor.framer(), [frame + bytes([crc8(frame)]) for frame in frames])
 
-    assert made.decoded(sensor, runs).values[0].ravel().tolist() == [1234, 0, 1, 65535, 600]
+    assert decode_runs(sensor, runs).values[0].ravel().tolist() == [1234, 0, 1, 65535, 600]
     assert losses == []
 
 
@@ -43,15 +46,15 @@ def test_a_distance_by_hand_is_encoded() -> None:
 @given(seed=st.integers(0, 1 << 30))
 def test_what_is_encoded_is_decoded(seed: int) -> None:
     sent = made.samples("teraranger", TeraRanger(), 30, seed)
-    assert made.same(TeraRanger().decode(TeraRanger().encode(sent)), sent)
+    assert are_equal(TeraRanger().decode(TeraRanger().encode(sent)), sent)
 
 
 def test_the_device_streams_after_the_opening_and_stops_after_the_closing() -> None:
     sensor = TeraRanger()
-    device = sensor.device()
+    device = device_for(sensor)
     streaming = [device.streaming]
 
-    described.hold(sensor.opening({}), device)
+    hold_dialogue(sensor.opening({}), device)
     streaming.append(device.streaming)
     device.hear(sensor.closing())
     streaming.append(device.streaming)
@@ -60,7 +63,7 @@ def test_the_device_streams_after_the_opening_and_stops_after_the_closing() -> N
 
 
 def test_a_command_in_pieces_is_heard() -> None:
-    device = TeraRanger().device()
+    device = device_for(TeraRanger())
     for byte in b"\x00\x99" + BINARY + START:
         device.hear(bytes([byte]))
     assert device.streaming

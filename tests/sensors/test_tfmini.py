@@ -7,7 +7,10 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.tfmini import TfMini, command
-from tests.sensors import described, made
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 # 59 59, 300 cm, strength 1000, temperature 2288 / 8 - 256 = 30 °C; the sum of 59 59 2C 01 E8 03 F0 08 is 2C2
 PLUS = bytes.fromhex("59 59 2C 01 E8 03 F0 08 C2")
@@ -17,17 +20,17 @@ WEAK = bytes.fromhex("59 59 FF FF 13 00 F0 08 BB")  # B2 + FF + FF + 13 + F0 + 0
 
 
 def test_a_frame_by_hand_is_decoded() -> None:
-    runs, losses = made.through(TfMini().framer(), [PLUS, WEAK, PLUS])
+    runs, losses = feed_framer(TfMini().framer(), [PLUS, WEAK, PLUS])
 
-    assert made.decoded(TfMini(), runs).values[0].tolist() == [[300, 1000, 2288], [65535, 19, 2288], [300, 1000, 2288]]
+    assert decode_runs(TfMini(), runs).values[0].tolist() == [[300, 1000, 2288], [65535, 19, 2288], [300, 1000, 2288]]
     assert losses == []
 
 
 def test_the_original_sends_its_mode_instead_of_a_temperature() -> None:
     sensor = TfMini(model="original")
-    runs, _ = made.through(sensor.framer(), [ORIGINAL, ORIGINAL])
+    runs, _ = feed_framer(sensor.framer(), [ORIGINAL, ORIGINAL])
 
-    words, mode_and_spare = made.decoded(sensor, runs).values
+    words, mode_and_spare = decode_runs(sensor, runs).values
 
     assert words.tolist() == [[121, 20]] * 2 and mode_and_spare.tolist() == [[2, 0]] * 2
     assert [field.name for field in sensor.fields()] == ["distance", "strength", "mode", "spare"]
@@ -38,7 +41,7 @@ def test_the_original_sends_its_mode_instead_of_a_temperature() -> None:
 def test_what_is_encoded_is_decoded(model: str, seed: int) -> None:
     sensor = TfMini(model=model)  # type: ignore[arg-type]
     sent = made.samples("tfmini", sensor, 30, seed)
-    assert made.same(sensor.decode(sensor.encode(sent)), sent)
+    assert are_equal(sensor.decode(sensor.encode(sent)), sent)
 
 
 def test_a_frame_in_the_payload_of_another_gives_no_sample() -> None:
@@ -47,7 +50,7 @@ def test_a_frame_in_the_payload_of_another_gives_no_sample() -> None:
     frames[:, 2:4] = [0x59, 0x59]  # a distance that looks like the marker
     frames[:, 8] = frames[:, :8].sum(axis=1)
 
-    runs, losses = made.through(sensor.framer(), [frames.tobytes()[5:]], at_once=1)
+    runs, losses = feed_framer(sensor.framer(), [frames.tobytes()[5:]], at_once=1)
 
     assert {bytes(frame) for run in runs for frame in run.frames} <= {bytes(frame) for frame in frames}
     assert [loss.cause for loss in losses] == ["start"]
@@ -62,9 +65,9 @@ def test_commands_are_those_of_the_manual() -> None:
 
 def test_the_device_answers_the_opening_and_takes_the_rate() -> None:
     sensor = TfMini(rate_hz=500, unit="mm")
-    device = sensor.device()
+    device = device_for(sensor)
 
-    messages = described.hold(sensor.opening({}), device, before=PLUS + PLUS[:4])
+    messages = hold_dialogue(sensor.opening({}), device, greeting=PLUS + PLUS[:4]).sent
 
     assert messages == [command(5, b"\x06"), command(3, b"\xf4\x01"), command(0x11), command(7, b"\x01")]
     assert device.rate_hz == 500 and device.streaming

@@ -19,6 +19,7 @@ from tacpipe.recording.reading import LinkReader
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples
 from tacpipe.sensors.ur_rtde import UrRtde
+from tests.emulation.devices import device_for
 from tests.sensors.talking import opened, reply_of
 
 ALL_KINDS = (
@@ -187,7 +188,7 @@ def test_the_client_of_ur_rtde_reads_what_our_controller_sends() -> None:
 
     def serve() -> None:
         connection, _ = listener.accept()
-        controller = sensor.device()
+        controller = device_for(sensor)
         connection.settimeout(0.01)
         with connection, suppress(OSError):  # the client is gone
             while True:

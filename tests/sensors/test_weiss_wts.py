@@ -7,7 +7,10 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.weiss_wts import WeissWts, message, messages, run_lengths
-from tests.sensors import described, made
+from tacpipe.testing.dialogues import hold_dialogue
+from tacpipe.testing.frames import are_equal, decode_runs, feed_framer
+from tests.emulation.devices import device_for
+from tests.sensors import made
 
 SMALL = WeissWts(rows=2, columns=3)
 PLAIN = message(0, bytes.fromhex("10270000 00" + "0100 0200 0300 FF0F 0000 0500".replace(" ", "")))  # A frame at 0.1 s.
@@ -19,9 +22,9 @@ def test_the_message_of_the_published_driver_has_this_sum() -> None:
 
 
 def test_frames_by_hand_are_decoded_plain_and_run_length_coded() -> None:
-    runs, losses = made.through(SMALL.framer(), [PLAIN, CODED])
+    runs, losses = feed_framer(SMALL.framer(), [PLAIN, CODED])
 
-    samples = made.decoded(SMALL, runs)
+    samples = decode_runs(SMALL, runs)
 
     assert samples.values[0].tolist() == [[1, 2, 3, 4095, 0, 5], [1, 1, 1, 1, 1, 4095]]
     assert samples.t_device_ns is not None and samples.t_device_ns.tolist() == [100_000_000, 100_160_000]
@@ -45,32 +48,32 @@ def test_what_is_encoded_is_decoded(compress: bool, seed: int, levels: int) -> N
     sent = made.samples("weiss-wts", sensor, 12, seed)
     sent.values[0][:] %= levels * 3  # Few levels give long runs, as on a pad with little contact.
 
-    runs, losses = made.through(sensor.framer(), sensor.encode(sent))
+    runs, losses = feed_framer(sensor.framer(), sensor.encode(sent))
 
-    assert made.same(made.decoded(sensor, runs), sent) and losses == []
+    assert are_equal(decode_runs(sensor, runs), sent) and losses == []
 
 
 def test_replies_among_frames_have_no_sample() -> None:
-    runs, losses = made.through(SMALL.framer(), [PLAIN, message(0x23, b"\0\0"), PLAIN, message(0x21, b"\0\0")])
+    runs, losses = feed_framer(SMALL.framer(), [PLAIN, message(0x23, b"\0\0"), PLAIN, message(0x21, b"\0\0")])
 
-    assert len(made.decoded(SMALL, runs)) == 2 and losses == []
+    assert len(decode_runs(SMALL, runs)) == 2 and losses == []
 
 
 @pytest.mark.parametrize(
     "payload", ["10270000 00 0100", "10270000 01 0140", "10270000 01 0150 FF2F", "10270000", "10270000 00 " + "00" * 13]
 )
 def test_a_frame_with_another_number_of_cells_is_lost(payload: str) -> None:
-    runs, losses = made.through(SMALL.framer(), [PLAIN, PLAIN, message(0, bytes.fromhex(payload)), PLAIN, PLAIN])
+    runs, losses = feed_framer(SMALL.framer(), [PLAIN, PLAIN, message(0, bytes.fromhex(payload)), PLAIN, PLAIN])
 
-    assert len(made.decoded(SMALL, runs)) == 4
+    assert len(decode_runs(SMALL, runs)) == 4
     assert len(losses) == 1 and losses[0].frames <= 1
 
 
 def test_the_device_answers_the_opening_while_it_still_streams() -> None:
-    device = SMALL.device()
+    device = device_for(SMALL)
     device.streaming = True
 
-    sent_messages = described.hold(SMALL.opening({}), device, before=PLAIN + PLAIN[:9])
+    sent_messages = hold_dialogue(SMALL.opening({}), device, greeting=PLAIN + PLAIN[:9]).sent
 
     assert [next(messages(sent_message))[0] for sent_message in sent_messages] == [0x22, 0x30, 0x21]
     assert device.streaming and device.rate_hz == 100
@@ -78,7 +81,7 @@ def test_the_device_answers_the_opening_while_it_still_streams() -> None:
 
 def test_a_sensor_with_another_matrix_is_named() -> None:
     with pytest.raises(DeviceError, match=r"2 rows and 3 columns.*14 and 6"):
-        described.hold(WeissWts().opening({}), SMALL.device())
+        hold_dialogue(WeissWts().opening({}), device_for(SMALL))
 
 
 def test_a_refusal_is_an_error() -> None:
@@ -91,9 +94,9 @@ def test_a_refusal_is_an_error() -> None:
 
 
 def test_a_tare_is_answered_and_a_closing_stops() -> None:
-    device = SMALL.device()
-    described.hold(SMALL.opening({}), device)
-    assert described.hold(SMALL.taring(), device) == [message(0x23, b"\x01")]
+    device = device_for(SMALL)
+    hold_dialogue(SMALL.opening({}), device)
+    assert hold_dialogue(SMALL.taring(), device).sent == [message(0x23, b"\x01")]
     device.hear(SMALL.closing())
     assert not device.streaming
 

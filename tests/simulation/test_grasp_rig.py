@@ -12,7 +12,6 @@ import pytest
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import depth_camera, grasp_scene
@@ -289,19 +288,3 @@ def test_sensors_feel_nothing_before_contact_and_the_whole_touch_while_it_is_hel
         np.testing.assert_allclose(holding[names].mean(), read[names].to_numpy(float), atol=25)
     after = felt[felt.t_ns > truth_values["gt_release_ns"] + 3e8]
     np.testing.assert_allclose(after.drop(columns="t_ns").mean(), before.drop(columns="t_ns").mean(), atol=6)
-
-
-@pytest.mark.parametrize(
-    ("rig", "words"),
-    [
-        (GraspRig(families="box,teapot"), "There is no family 'teapot'"),
-        (GraspRig(stiffness="jelly"), "There is no stiffness 'jelly'"),
-        (GraspRig(objects=0), "objects is 0"),
-        (GraspRig(shift=1.5), "shift is 1.5"),
-        (GraspRig(effort_spread=-1), "effort_spread is -1"),
-        (GraspRig(raw=True, spheres=True), "raw and spheres are both set"),
-    ],
-)
-def test_a_rig_that_cannot_be_is_refused(rig: GraspRig, words: str) -> None:
-    with pytest.raises(TacpipeError, match=words):
-        simulate_trial(SEED, 0, rig)

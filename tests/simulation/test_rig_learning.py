@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.metrics.intervals import skill
 from tacpipe.plugins.registry import load
+from tacpipe.scores.intervals import skill
 from tacpipe.simulation import taxels, trajectory
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward import training as forward_training

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from tacpipe.errors import TacpipeError
 from tacpipe.formats.roboskin import is_time, lag_one, scramble, unscramble
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.registry import load
@@ -365,12 +364,3 @@ def test_materials_sessions_and_trials_have_random_numbers_of_their_own() -> Non
     calm, strong = (simulate_trial(0, 4, replace(PLAIN, session_scale=scale)) for scale in (0.0, 1.0))
     assert calm.streams["truth"].equals(strong.streams["truth"])
     assert not calm.streams["biotac"].equals(strong.streams["biotac"])
-
-
-def test_a_rig_that_cannot_be_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="'other'"):
-        simulate_trial(0, 0, SlideRig(spectra="other"))
-    with pytest.raises(TacpipeError, match=r"materials is 0.*1"):
-        simulate_trial(0, 0, SlideRig(materials=0))
-    with pytest.raises(TacpipeError, match=r"speed_m_s is 0\.0.*above 0"):
-        simulate_trial(0, 0, SlideRig(speed_m_s=0.0))

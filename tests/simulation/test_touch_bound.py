@@ -18,7 +18,7 @@ def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognorma
     situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(1)
     possible = grasp.draw_readings(
-        situation, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
+        situation, sensors(SEED), rng, GraspRig(effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0), 40_000
     )
     mean, variance = grasp.mean_and_variance(possible)
     limit = 140 * pinch.limits_n(situation.opening_m)
@@ -31,7 +31,7 @@ def test_drift_and_noise_add_their_own_variances() -> None:
     situation = perform(SEED, 2, GraspRig(stiffness="rigid")).situation
     rng = np.random.default_rng(2)
     possible = grasp.draw_readings(
-        situation, sensors(SEED), rng, draws=20_000, effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0
+        situation, sensors(SEED), rng, GraspRig(effort_spread=0.0, noise_scale=0.0, drift_count_day=30.0), 20_000
     )
     periods = np.array([2.0, 3.0, 5.0])
     expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # Variances of three waves, and of rounding.
@@ -52,7 +52,7 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
             fingertip_sp.to_counts(repeated_touch.signal + sensor_pair.noise * rng.normal(size=(2, 25)))
         )
     mean, variance = grasp.mean_and_variance(np.array(repeated_counts))
-    expected_mean, spread = grasp.mean_and_variance(grasp.draw_readings(scene.situation, sensor_pair, rng, draws=3_000))
+    expected_mean, spread = grasp.mean_and_variance(grasp.draw_readings(scene.situation, sensor_pair, rng, RIG, 3_000))
     np.testing.assert_allclose(expected_mean, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
     np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
 

@@ -57,8 +57,17 @@ def test_cells_are_the_mean_change_of_the_images_since_the_first_ones(video: Pat
                 assert np.allclose(values, (cells - reference)[:, colour], atol=1e-4)
 
 
+def test_without_reference_frames_a_row_is_the_brightness_of_its_frame_alone(video: Path) -> None:
+    frames = frames_of(video)
+    brightness = differences(frames, reference_frames=0)
+    relative = differences(frames, reference_frames=1)
+    for name in (name for name in brightness.column_names if name.startswith("taxel")):
+        values = brightness[name].to_numpy()
+        assert np.allclose(values - values[0], relative[name].to_numpy(), atol=1e-3) and (values >= 0).all()
+
+
 @settings(max_examples=15, deadline=None)
-@given(stop=st.integers(1, 150), reference_frames=st.integers(1, 20))
+@given(stop=st.integers(1, 150), reference_frames=st.integers(0, 20))
 def test_rows_do_not_change_when_later_frames_are_cut_off(video: Path, stop: int, reference_frames: int) -> None:
     frames = frames_of(video)
     dts = frames.column("dts").to_numpy()

@@ -168,8 +168,8 @@ def test_contacts_of_simulated_trials_in_any_unit_are_those_in_counts_and_of_the
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="published recordings are not here")
 def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Recording) -> None:
     ingest, overlaps = load("ingest.xela-flat"), []
-    assert ingest.discover is not None
-    trials = ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move")
+    assert ingest.source is not None
+    trials = ingest.source.discover(ingest.params(), SAMPLE / "xela_flat_pick_move")
     for files in list(trials.values())[::4]:
         synced = synchronize(synchronize.params(rate_hz=50.0), shard(ingest(ingest.params(), files).streams)).streams[
             ""
@@ -354,8 +354,8 @@ def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Recording) -
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard: Recording) -> None:
     ingest = load("ingest.xela-flat")
-    assert ingest.discover is not None
-    for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
+    assert ingest.source is not None
+    for files in ingest.source.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
         recording = ingest(ingest.params(), files)
         synced = synchronize(synchronize.params(rate_hz=50.0), shard(recording.streams)).streams[""]
         labelled = contacts(segment.params(), shard({"": synced}))

@@ -188,8 +188,8 @@ def test_recordings_without_a_slide_are_refused_with_a_sentence(shard: Recording
 def published() -> dict[str, Any]:
     """The published BioTac slides: recording name to what ingest gives."""
     ingest = load("ingest.biotac-slide")
-    assert ingest.discover is not None
-    files_by_name = ingest.discover(ingest.params(), SAMPLE / "biotac_slide_20_50")
+    assert ingest.source is not None
+    files_by_name = ingest.source.discover(ingest.params(), SAMPLE / "biotac_slide_20_50")
     return {name: ingest(ingest.params(), files) for name, files in files_by_name.items()}
 
 

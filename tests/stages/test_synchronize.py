@@ -299,8 +299,8 @@ def test_a_tactile_channel_that_wraps_is_unwrapped_and_no_other_one_changes(shar
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_nothing_wraps_in_the_published_trials(shard: Recording) -> None:
     ingest = load("ingest.xela-flat")
-    assert ingest.discover is not None
-    for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
+    assert ingest.source is not None
+    for files in ingest.source.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
         recording = ingest(ingest.params(), files)
         logged, attributes = run(shard(recording.streams), grid="logged")
         assert not any("wrapped" in name for name in attributes)

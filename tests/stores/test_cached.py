@@ -18,7 +18,7 @@ import pytest
 from tacpipe.engine import computing
 from tacpipe.engine.keys import Done, WorkerTask, identity
 from tacpipe.errors import StorageError, TacpipeError, UsageError
-from tacpipe.maintenance import remote_upkeep, transfer
+from tacpipe.maintenance import garbage, repair, transfer
 from tacpipe.store import cached, location, records
 from tacpipe.store.addresses import BucketAddress, parse_address
 from tacpipe.store.bucket import Bucket
@@ -134,7 +134,7 @@ def emptied(computers: Computers, request: pytest.FixtureRequest) -> Callable[[d
 def expect_whole(files: Bucket) -> None:
     """Expect that a bucket is sound, and that every record names what is there."""
     store = RemoteStore(files)
-    report = remote_upkeep.verify(store)
+    report = repair.verify(store)
     assert report.clean, report.to_text()
     named_digests = {
         shard["digest"]
@@ -698,12 +698,12 @@ def test_a_collection_at_any_request_of_a_run_takes_nothing_that_it_needs(
     computers.run("first", SIMULATE)
     for root in RemoteStore(files).roots.all():
         RemoteStore(files).roots.remove(root)
-    garbage = files.content()  # nothing names these objects any more, and a run would reuse them
+    abandoned = files.content()  # nothing names these objects any more, and a run would reuse them
 
     def collect() -> None:
-        remote_upkeep.collect(RemoteStore(files), dry_run=False, recordings=True)
+        garbage.collect(RemoteStore(files), dry_run=False, recordings=True)
 
-    for base in ({}, garbage):
+    for base in ({}, abandoned):
         for step in steps(emptied, base, stride, lambda: computers.run("first", SIMULATE)):
             files = emptied(base)
             files.begin(step, collect)

@@ -1,5 +1,6 @@
 """Test every order of a push and a concurrent operation in a store without locks."""
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import pytest
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.maintenance import copying, remote_upkeep, transfer
+from tacpipe.maintenance import copying, garbage, repair, transfer
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.remote import RemoteStore
 from tests.conftest import Lab
@@ -31,7 +32,7 @@ def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **options: A
 def expect_whole(files: Bucket, manifests: set[str]) -> None:
     """Expect all objects that the pushed datasets name, and that these datasets are ``manifests``."""
     store = RemoteStore(files)
-    report = remote_upkeep.verify(store)
+    report = repair.verify(store)
     assert report.clean, report.to_text()
     assert {root["manifest"] for root in store.roots.all()} == manifests
 
@@ -61,7 +62,7 @@ def steps_of(content: dict[str, bytes], work: Callable[[Stepping], object], stri
 
 
 def collect(files: Bucket) -> None:
-    remote_upkeep.collect(RemoteStore(files), dry_run=False, recordings=True)
+    garbage.collect(RemoteStore(files), dry_run=False, recordings=True)
 
 
 @EVERY
@@ -143,7 +144,7 @@ def test_a_push_that_is_killed_at_any_step_leaves_what_was_pushed_before_and_its
             push(monkeypatch, files, "data/s")
             killed()
         if RemoteStore(files).check():
-            assert remote_upkeep.verify(RemoteStore(files)).clean
+            assert repair.verify(RemoteStore(files)).clean
         push(monkeypatch, files, "data/s")
         expect_whole(files, {manifest(lab, "data/s")})
         assert {name: value for name, value in files.content().items() if name in expected} == expected
@@ -182,7 +183,7 @@ def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_
         (root,) = RemoteStore(files).roots.all()
         history = {root["manifest"], *(entry["manifest"] for entry in root["history"])}
         assert {*other_manifests, *([] if refused else [labelled])} <= history, (step, refused)
-        assert remote_upkeep.verify(RemoteStore(files)).clean
+        assert repair.verify(RemoteStore(files)).clean
         count("pushes of one name at once")
 
 
@@ -287,3 +288,30 @@ def test_answers_that_differ_are_an_error_of_the_server_and_two_alike_are_damage
     damaging(monkeypatch, pushed, "roots/", [b"<html>"] * 2)
     with pytest.raises(DamagedError, match=r"two reads gave the same bytes. Delete it"):
         store.roots.pushed("data/r", project)
+
+
+def test_a_collection_takes_what_was_quarantined_fourteen_days_ago(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate toy -o data/s --trials 2 --rows 3")
+    files = Stepping({})
+    push(monkeypatch, files, "data/s")
+    before = files.content()
+    ages_days = {"1" * 64: 13.9, "2" * 64: 14.1}
+    for name, age_days in ages_days.items():
+        files.create(f"quarantine/{name}.{time.time_ns() - int(age_days * 86400e9)}", b"damaged")
+    collect(files)
+    kept = {name for name in files.content() if name.startswith("quarantine/")}
+    assert [name.split("/")[1].partition(".")[0] for name in kept] == ["1" * 64]
+    assert before.keys() <= files.content().keys()
+
+
+def test_nothing_is_collected_while_a_manifest_that_others_need_is_in_quarantine(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes]
+) -> None:
+    files = Stepping(abandoned)
+    push(monkeypatch, files, "data/s")
+    (needed,) = lab.manifest("data/s").ancestors
+    assert RemoteStore(files).quarantine(needed)
+    content = files.content()
+    with pytest.raises(DamagedError, match=f"{needed[:12]}.*nothing was removed"):
+        collect(files)
+    assert files.content() == content

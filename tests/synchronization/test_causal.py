@@ -49,8 +49,16 @@ def push(grid: Grid, placement: Placement, name: str, t_ns: Times, values: AnyFl
 @pytest.mark.parametrize("arrivals", [True, False])
 @pytest.mark.parametrize("kind", ["uniform", "logged", "fresh"])
 @settings(deadline=None, max_examples=25)
-@given(cuts=st.lists(st.integers(0, 900), max_size=20), turned=st.booleans())
-def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, arrivals: bool, cuts: list[int], turned: bool) -> None:
+@given(
+    cuts=st.lists(st.integers(0, 900), max_size=20),
+    turned=st.booleans(),
+    early_ms=st.sampled_from(
+        [0, 5, 250]
+    ),  # samples are passed that early before rows up to their arrival are asked for
+)
+def test_rows_are_those_of_the_stage_to_the_last_bit(
+    kind: str, arrivals: bool, cuts: list[int], turned: bool, early_ms: int
+) -> None:
     tables = {name: stated(table, arrivals=arrivals) for name, table in STREAMS[arrivals].items()}
     recording = FakeRecording(tables)
     result = synchronize(synchronize.params(**ROWS[kind], gap_ms=20.0), recording)
@@ -62,11 +70,11 @@ def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, arrivals: bool, 
     for until_ns in [*sorted(T0 + cut * MS for cut in cuts if T0 + cut * MS < last), last]:
         for name in sorted(tables, reverse=turned):
             t_ns = tables[name]["t_ns"].to_numpy()
-            due = (t_ns > before) & (t_ns <= until_ns)
+            due = (t_ns > before) & (t_ns <= until_ns + early_ms * MS)
             columns = [tables[name].column(index).to_numpy()[due] for index in range(1, tables[name].num_columns)]
             push(grid, placements[name], name, t_ns[due], np.column_stack(columns).astype(np.float64))
         parts.append(grid.rows(until_ns))
-        before = until_ns
+        before = until_ns + early_ms * MS
     sampled_masks = [part.has_samples for part in parts]
     t_ns = np.concatenate([part.t_ns[mask] for part, mask in zip(parts, sampled_masks, strict=True)])
     assert t_ns.tolist() == expected["t_ns"].to_pylist() and len(t_ns) > 20

@@ -65,3 +65,20 @@ def test_two_points_of_one_stream_are_two_paths_and_a_cloud_is_none() -> None:
     ]
     cloud = pa.table({"t_ns": [0] * 9, **{f"{axis}_m": np.arange(9.0) for axis in "xyz"}})
     assert curves.paths_of_table("cloud", cloud) == []
+
+
+def test_forecasts_of_the_channel_that_varies_most_stand_at_the_times_that_they_are_for() -> None:
+    rows = np.arange(6.0)
+    columns = {"flat": 0 * rows, "flat_t1": 0 * rows, "load": rows, "load_t1": rows + 1, "load_t3": rows + 3}
+    fields = [pa.field(curves.TIME, pa.int64())]
+    for name in columns:
+        step = {"step": name[-1]} if "_t" in name else {}
+        quantity = "prediction" if step else "tactile"
+        fields.append(pa.field(name, pa.float64(), metadata={"quantity": quantity, "unit": "N", **step}))
+    table = pa.Table.from_arrays([pa.array(np.arange(6)), *map(pa.array, columns.values())], schema=pa.schema(fields))
+    (drawn,) = curves.curves_of_table("skin", table)
+    assert drawn.names == ("measured", "forecast 1 row ahead", "forecast 3 rows ahead")
+    assert (drawn.title, drawn.unit) == ("skin load (N)", "N")
+    for column, ahead in ((1, 1), (2, 3)):  # each forecast is right, so it is the measurement where it is drawn
+        assert np.isnan(drawn.values[:ahead, column]).all()
+        assert (drawn.values[ahead:, column] == rows[ahead:]).all()

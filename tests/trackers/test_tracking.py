@@ -10,8 +10,8 @@ import torch
 
 import tacpipe
 from tacpipe.errors import StorageError, TacpipeError, UsageError
-from tacpipe.metrics import headline
 from tacpipe.plugins import registry
+from tacpipe.scores import headline
 from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracking
 from tacpipe.training import following, loop
@@ -163,8 +163,10 @@ def test_stages_that_train_or_evaluate_can_be_tracked_and_no_others() -> None:
     }
     assert tracked_stages & built_in == {
         *(
+            "train.classify",
             "train.forward",
             "train.material",
+            "train.regress",
             "train.slip",
             "train.touch",
             "compress.autoencoder",

@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from torch import nn
 
 from tacpipe.models import lstm
-from tacpipe.store.store import Store
 from tacpipe.training.devices import use_device
 from tests.conftest import tacpipe
 from tests.training.networks import NETWORKS, losses
@@ -78,22 +76,3 @@ def test_a_checkpoint_of_one_device_is_resumed_on_the_other(first: str, second: 
     with use_device(second):  # type: ignore[arg-type]
         resumed = losses(train(tmp_path / "cut", epochs=4))
     assert resumed == pytest.approx(uninterrupted, rel=CLOSE)
-
-
-def test_stages_of_a_chain_that_run_at_the_same_time_train_on_a_gpu_each(project: Path) -> None:
-    """They are forked from a process that has loaded torch; CUDA cannot be begun before a fork."""
-    stages = {
-        f"train-{seed}": {"cmd": f"tacpipe {TRAIN} --epochs 2 --seed {seed} -o models/seed-{seed}"}
-        for seed in (1, 2, 3)
-    }
-    (project / "chain.yaml").write_text(yaml.safe_dump({"stages": stages}))
-    process = tacpipe(project, "run chain.yaml --jobs 3")
-    assert process.returncode == 0, process.stderr
-    devices = [
-        record["provenance"]["device"]
-        for _, record in Store(project / ".tacpipe").records()
-        if "stage" in (identity := record["identity"])
-        and identity["stage"] == "train.forward"
-        and identity["params"].get("seed") in (1, 2, 3)
-    ]
-    assert devices == ["cuda"] * 3

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 from tacpipe.engine import provenance
 from tacpipe.errors import UsageError
@@ -62,15 +61,6 @@ def test_without_the_variable_the_gpus_of_the_driver_count(tmp_path: Path, monke
     for address in ("0000:17:00.0", "0000:65:00.0"):
         (tmp_path / address).mkdir()
     assert [devices.gpu_for(worker)["CUDA_VISIBLE_DEVICES"] for worker in range(3)] == ["0", "1", "0"]
-
-
-def test_stages_that_run_at_the_same_time_see_a_gpu_each(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5")
-    wait = "while [ ! -e seen-a ] || [ ! -e seen-b ]; do sleep 0.01; done"
-    stages = {name: {"cmd": f"echo $CUDA_VISIBLE_DEVICES > seen-{name}; {wait}"} for name in ("a", "b")}
-    (lab.folder / "chain.yaml").write_text(yaml.safe_dump({"stages": stages}))
-    lab.run("run chain.yaml --jobs 2")
-    assert {(lab.folder / f"seen-{name}").read_text().strip() for name in ("a", "b")} == {"4", "5"}
 
 
 def test_only_stages_that_train_take_a_device(lab: Lab) -> None:

@@ -19,6 +19,7 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from multiprocessing import util
 from pathlib import Path
@@ -198,8 +199,6 @@ class Dask:
 
     def _results(self, futures: Sequence[Future[Any]], stage: str) -> Iterator[Done]:
         """Yield the results of each chunk when it is finished. Raises the errors of `run`."""
-        from concurrent.futures import CancelledError
-
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 

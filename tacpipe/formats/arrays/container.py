@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -20,21 +19,20 @@ from tacpipe.formats.arrays.tree import (
     MAX_TEXT,
     ArrayDescription,
     StoredAttributes,
-    StoredValue,
     Tree,
     columns_of_array,
-    encoded_size,
-    is_encoded,
+    first_picture,
     is_text,
     picture_column,
     pixel_format,
     plain_attributes,
 )
-from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
+from tacpipe.formats.container import Batched, Container, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.table import column_names
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
+from tacpipe.video.images import picture_encoding
 
 LOOK_ROWS = 3  # number of rows read by `ArrayContainer.look`
 BLOCK_BYTES = 1 << 25  # number of bytes read at once; larger chunks of a file are read completely
@@ -46,7 +44,7 @@ RowsOf = Callable[[Tree, Episode, StreamArrays], "pa.Table | Batched"]
 
 
 @dataclass(frozen=True)
-class ArrayContainer:
+class ArrayContainer(Container):
     """A file of arrays that ``open_tree`` opens."""
 
     path: Path
@@ -143,7 +141,12 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
     parts_read = []
     for part in contents.parts:
         array, is_empty = part.arrays[0], not episodes.row_count(episode, part)
-        if part.frames and not is_empty and not pixel_format(array) and not is_encoded(tree, array, episode.start):
+        if (
+            part.frames
+            and not is_empty
+            and not pixel_format(array)
+            and not picture_encoding(first_picture(tree, array, episode.start))
+        ):
             skipped[part.source] = "holds pictures that are not encoded as JPEG, PNG or WebP, which are not read"
         else:
             parts_read.append(part)
@@ -249,7 +252,7 @@ def _block_rows(tree: Tree, episode: Episode, part: StreamArrays) -> int:
     """Return the number of rows read at once. It covers whole chunks, because a file cannot read less."""
     row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all_arrays)
     if part.frames and episodes.row_count(episode, part) and not pixel_format(part.arrays[0]):
-        row_bytes += encoded_size(tree, part.arrays[0], episode.start)
+        row_bytes += len(first_picture(tree, part.arrays[0], episode.start))
     rows = max(1, BLOCK_BYTES // row_bytes)
     chunk_rows = max(array.chunk_rows for array in part.all_arrays)
     return -(-rows // chunk_rows) * chunk_rows if chunk_rows else rows
@@ -298,19 +301,5 @@ def _flatten_json(text: Any) -> StoredAttributes:
     >>> _flatten_json('{"env_name": "Lift", "env_kwargs": {"control_freq": 20}}')
     {'env_name': 'Lift', 'env_kwargs.control_freq': 20}
     """
-    if not isinstance(text, str) or not text.startswith("{"):
-        return {}
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    return dict(_leaves(content))
-
-
-def _leaves(value: StoredAttributes, before: str = "") -> Iterator[tuple[str, StoredValue]]:
-    """Yield the dotted name and value of each leaf of nested objects, up to `MAX_DEPTH` levels."""
-    for name, inner in value.items():
-        if isinstance(inner, dict) and before.count(".") < MAX_DEPTH:
-            yield from _leaves(inner, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", inner
+    is_object = isinstance(text, str) and text.startswith("{")
+    return container.flatten(container.json_object(text), max_depth=MAX_DEPTH) if is_object else {}

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray
+from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import (
     ArrayDescription,
@@ -22,7 +22,8 @@ from tacpipe.formats.arrays.tree import (
     reason_left_out,
     walk,
 )
-from tacpipe.formats.container import Time, TimeUnit
+from tacpipe.formats.container import Time, TimeUnit, json_object, natural_order
+from tacpipe.formats.table import stamps
 from tacpipe.io import memory
 from tacpipe.printable import plain
 
@@ -68,7 +69,7 @@ def find_episodes(tree: Tree) -> list[Episode]:
     if not groups:
         return [Episode(None)]
     names = Counter(group.rpartition("/")[2] for group in groups)
-    return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=_natural_order)]
+    return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=natural_order)]
 
 
 def _is_numbered(group: str) -> bool:
@@ -160,10 +161,6 @@ def _read_ends(tree: Tree, array: ArrayDescription) -> AnyArray:
             f"{f', the one before {ends[row - 1]}' if row else ''}."
         )
     return ends
-
-
-def _natural_order(path: str) -> list[int | str]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)]
 
 
 TIME = re.compile(
@@ -343,13 +340,6 @@ def _is_time(array: ArrayDescription) -> bool:
 
 
 RATES = ("rate_hz", "fps", "frequency_hz", "frequency", "control_freq", "sampling_rate", "sample_rate", "rate", "hz")
-UNITS: Mapping[str, TimeUnit] = {
-    **{"s": "s", "sec": "s", "second": "s", "seconds": "s", "ms": "ms", "millisecond": "ms", "milliseconds": "ms"},
-    **{"us": "us", "µs": "us", "microsecond": "us", "microseconds": "us", "ns": "ns", "nanosecond": "ns"},
-    "nanoseconds": "ns",
-}
-SINCE_1970: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns"))
-MIN_UNIX_S = 1e8  # Unix time in seconds; smaller values count from the start of a recording
 
 
 def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
@@ -359,7 +349,7 @@ def time_of_part(tree: Tree, episode: Episode, part: StreamArrays) -> Time:
         unit = _stamp_unit(part, size)
         if unit is not None:
             declared = part.time is not None and part.time.attributes.get("quantity") == "time"
-            since_1970 = declared or size >= MIN_UNIX_S * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
+            since_1970 = declared or size >= stamps.MIN_UNIX_S * 10 ** (9 - stamps.DIGITS[unit])
             return Time(column=part.clock, unit=unit, origin="unix" if since_1970 else "start")
     rate = declared_rate_hz(tree, episode, part)
     return Time() if rate is None else Time(rate_hz=rate)
@@ -403,10 +393,10 @@ def _stamp_unit(part: StreamArrays, size: float) -> TimeUnit | None:
     attributes = part.time.attributes if part.time is not None else {}
     declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
     suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)
-    unit = UNITS.get(declared.strip().lower()) or (UNITS.get(suffix[1].lower()) if suffix else None)
-    if unit is None and size >= MIN_UNIX_S:
-        return next(unit for limit, unit in SINCE_1970 if size < limit)
-    return unit
+    texts = [declared.replace("µ", "u"), suffix[1] if suffix else ""]
+    units = (schema.unit_from_text(text.lower()) for text in texts)
+    stated = next((cast("TimeUnit", unit) for unit in units if unit in stamps.DIGITS), None)
+    return stated or stamps.unit_of_unix_time(size)
 
 
 def declared_rate_hz(tree: Tree, episode: Episode, part: StreamArrays | None) -> float | None:
@@ -425,10 +415,5 @@ def _declared_rate(attributes: StoredAttributes) -> float | None:
         if isinstance(value, int | float | np.number) and np.isfinite(value) and 0 < value <= 1e9:
             return float(value)
     environment = attributes.get("env_args")  # robomimic: a text of JSON
-    if isinstance(environment, str | bytes):
-        try:
-            inner = json.loads(environment)["env_kwargs"]
-        except (ValueError, KeyError, TypeError, RecursionError):
-            return None
-        return _declared_rate({"control_freq": inner.get("control_freq")}) if isinstance(inner, dict) else None
-    return None
+    inner = json_object(environment).get("env_kwargs") if isinstance(environment, str | bytes) else None
+    return _declared_rate({"control_freq": inner.get("control_freq")}) if isinstance(inner, dict) else None

@@ -18,7 +18,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, StoredValue, with_time_first
+from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, StoredValue, Tree, with_time_first
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
@@ -33,20 +33,15 @@ FILTERS = {  # HDF5 numbers of the accepted filters; others may need third-party
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
 
 
-class Hdf5Tree:
+class Hdf5Tree(Tree):
     """An open HDF5 file. ``bytes_left`` is the number of bytes present in a truncated file, None for a complete file."""
 
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
         self.path, self._file, self._available = path, file, bytes_left
+        cut = f"{path} is cut short after {bytes_left or 0:,} bytes, and the rest is missing. Copy it again."
+        self.notes = [] if bytes_left is None else [cut]
         self._members: dict[str, tuple[list[ArrayDescription], list[str]]] = {}  # members of each listed group
         self._attributes_by_group: dict[str, StoredAttributes] = {}  # attributes of groups
-
-    @property
-    def notes(self) -> list[str]:
-        """Return a sentence about the missing part of a truncated file."""
-        if self._available is None:
-            return []
-        return [f"{self.path} is cut short after {self._available:,} bytes, and the rest is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """Return the arrays in a group, and the paths of the groups in it."""
@@ -99,12 +94,6 @@ class Hdf5Tree:
             rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
             values = (dataset.asstr(errors="replace") if is_text else dataset)[rows]
             return np.moveaxis(np.asarray(values), array.time_axis, 0) if array.shape else np.asarray(values)
-
-    def files(self, array: ArrayDescription, start: int, stop: int) -> None:
-        """Return None, because all arrays are in one file."""
-
-    def encoding_metadata(self, array: ArrayDescription) -> None:
-        """Return None, because the file itself contains the encoding."""
 
     @contextlib.contextmanager
     def _convert_read_errors(self, subject: str) -> Iterator[None]:

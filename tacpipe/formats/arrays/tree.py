@@ -21,7 +21,7 @@ from tacpipe.formats.table import column_names
 from tacpipe.formats.table.column_names import ColumnMeaning
 from tacpipe.io import memory
 from tacpipe.printable import plain
-from tacpipe.video.images import COLOURS, PICTURE, array_format, raw_images
+from tacpipe.video.images import COLOURS, PICTURE, array_format, picture_encoding, raw_images
 from tacpipe.video.stream import VideoFormat
 
 MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
@@ -67,13 +67,8 @@ class ArrayDescription:
 class Tree(Protocol):
     """An opened file of arrays."""
 
-    @property
-    def path(self) -> Path:
-        """The path of the file or folder."""
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """Sentences about missing parts of a truncated file."""
+    path: Path
+    notes: Sequence[str] = ()  # sentences about missing parts of a truncated file
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
         """Return the arrays and the paths of the groups in a group."""
@@ -83,6 +78,7 @@ class Tree(Protocol):
 
     def identity(self, group: str) -> Any:
         """Return a value that identifies a group, which may have several paths because of links."""
+        return group
 
     def attributes(self, group: str) -> StoredAttributes:
         """Return the attributes of a group."""
@@ -92,9 +88,11 @@ class Tree(Protocol):
 
     def files(self, array: ArrayDescription, start: int, stop: int) -> Mapping[str, Path] | None:
         """Return the files with these rows by path in the store, or None if the tree is a single file."""
+        return None
 
     def encoding_metadata(self, array: ArrayDescription) -> Any:
-        """Return the encoding of an array's rows as JSON, without the number of rows."""
+        """Return the encoding of an array's rows as JSON, without the number of rows, or None if the file has it."""
+        return None
 
 
 def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription]:
@@ -118,14 +116,8 @@ def with_time_first(arrays: Sequence[ArrayDescription]) -> list[ArrayDescription
             and array.shape[0] not in lengths
         ):
             matching = [axis for axis, length in enumerate(array.shape) if length in lengths]
-            longest = array.shape.index(max(array.shape))
-            is_small = (
-                firsts.count(array.shape[0]) == 1
-                and array.shape[0] < 100
-                and array.shape[longest] >= 4 * array.shape[0]
-            )
-            axis = longest if is_small else 0
-            axis = matching[0] if matching else axis
+            is_alone = firsts.count(array.shape[0]) == 1
+            axis = matching[0] if matching else is_alone * column_names.longer_axis(array.shape)
         shape = (array.shape[axis], *array.shape[:axis], *array.shape[axis + 1 :]) if array.shape else ()
         described.append(replace(array, shape=shape, time_axis=axis, chunk_rows=0 if axis else array.chunk_rows))
     return described
@@ -238,26 +230,9 @@ def _named_as_image(path: str) -> bool:
     return any(word in path.lower() for word in IMAGE_NAMES)
 
 
-MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png", b"RIFF": "webp"}  # image formats by their first bytes
-
-
-def picture_encoding(content: bytes) -> str:
-    r"""Return the encoding of a picture by its first bytes, or an empty string if it is none of `MAGIC`.
-
-    >>> picture_encoding(b"\xff\xd8\xff\xe0"), picture_encoding(b"abc")
-    ('jpeg', '')
-    """
-    return next((name for start, name in MAGIC.items() if content.startswith(start)), "")
-
-
-def is_encoded(tree: Tree, array: ArrayDescription, row: int) -> bool:
-    """Return whether a row is an encoded image, by its first bytes."""
-    return bool(picture_encoding(_rows_as_bytes(tree.read(array, row, row + 1))[0]))
-
-
-def encoded_size(tree: Tree, array: ArrayDescription, row: int) -> int:
-    """Return the size in bytes of a row of an image array."""
-    return len(_rows_as_bytes(tree.read(array, row, row + 1))[0])
+def first_picture(tree: Tree, array: ArrayDescription, row: int) -> bytes:
+    """Return the bytes of a row of an array that may contain encoded images."""
+    return _rows_as_bytes(tree.read(array, row, row + 1))[0]
 
 
 def picture_column(array: ArrayDescription, values: AnyArray) -> tuple[pa.Field, pa.Array]:

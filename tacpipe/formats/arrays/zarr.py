@@ -27,7 +27,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes
+from tacpipe.formats.arrays.tree import ArrayDescription, StoredAttributes, Tree
+from tacpipe.formats.faults import explaining
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
@@ -75,12 +76,11 @@ class ZarrNode(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ZarrTree:
+class ZarrTree(Tree):
     """A Zarr store. ``path`` is a folder or a zip file; ``names`` are the members of a zip file, None for a folder."""
 
     path: Path
     names: frozenset[str] | None
-    notes: Sequence[str] = ()
     _nodes: dict[str, ZarrNode | None] = field(default_factory=dict)  # metadata by path
 
     def members(self, group: str) -> tuple[list[ArrayDescription], list[str]]:
@@ -99,10 +99,6 @@ class ZarrTree:
         """Return whether a group has this path."""
         node = self._node(path)
         return node is not None and "shape" not in node.metadata
-
-    def identity(self, group: str) -> str:
-        """Return the path of a group, which is unique."""
-        return group
 
     def attributes(self, group: str) -> StoredAttributes:
         """Return the attributes of a group."""
@@ -127,21 +123,17 @@ class ZarrTree:
                 f"Copy the store again; if the program that wrote it leaves out chunks of fill values alone, as zarr 3 "
                 f"does, give --fill-missing-chunks."
             )
-        try:
-            with contextlib.ExitStack() as stack, self._store() as store:
-                zarr_array = zarr.open_array(store, path=array.path, mode="r")
-                chunk_bytes = math.prod(zarr_array.chunks) * max(array.dtype.itemsize, 1)
-                limit_bytes = UNPACKED_BYTES + array.row_bytes * max(end - start, 1) + 4 * chunk_bytes
-                stack.enter_context(memory.bounded(limit_bytes, f"{self.path}, {plain(array.path, 200)},"))
-                return np.asarray(zarr_array[() if not array.shape else slice(start, end)])
-        except BROKEN as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                with regular.failing(self.path):
-                    raise
-            raise TacpipeError(
-                f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {end}, cannot be read: "
-                f"{plain(str(error), 200)}. Copy the store again."
-            ) from error
+        subject = f"{self.path}: {plain(array.path, 200)}, rows {start + 1} to {end}, cannot be read: "
+        with (
+            explaining(BROKEN, subject, ". Copy the store again.", path=self.path),
+            contextlib.ExitStack() as stack,
+            self._store() as store,
+        ):
+            zarr_array = zarr.open_array(store, path=array.path, mode="r")
+            chunk_bytes = math.prod(zarr_array.chunks) * max(array.dtype.itemsize, 1)
+            limit_bytes = UNPACKED_BYTES + array.row_bytes * max(end - start, 1) + 4 * chunk_bytes
+            stack.enter_context(memory.bounded(limit_bytes, f"{self.path}, {plain(array.path, 200)},"))
+            return np.asarray(zarr_array[() if not array.shape else slice(start, end)])
 
     def chunks(self, array: ArrayDescription, start: int, stop: int) -> list[str]:
         """Return the names of the files in the store that contain rows of an array.
@@ -216,10 +208,8 @@ class ZarrTree:
 
     def _read_json(self, name: str) -> Any:
         """Return the JSON object in a file of the store. Raises `TacpipeError` if it is none."""
-        try:
+        with explaining((*BROKEN_ZIP, RecursionError), f"{self.path}: {plain(name, 200)} cannot be read: "):
             content = json.loads(self._read_metadata(name))
-        except (*BROKEN_ZIP, RecursionError) as error:
-            raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
         if not isinstance(content, dict):
             raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(content)}; it must be a JSON object.")
         return content
@@ -264,14 +254,9 @@ def open_zarr(path: Path) -> Iterator[ZarrTree]:
     """Open a Zarr store, folder or zip file. Raises `TacpipeError` if it is neither."""
     names = None
     if not path.is_dir():
-        try:
-            with _archive(path) as archive:
-                names = frozenset(archive.namelist())
-        except BROKEN_ZIP as error:
-            raise TacpipeError(
-                f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
-                f"file again."
-            ) from error
+        advice = ". Its table of contents lies at its end: copy the file again."
+        with explaining(BROKEN_ZIP, f"{path} is not a whole zip file: ", advice), _archive(path) as archive:
+            names = frozenset(archive.namelist())
     tree = ZarrTree(path, names)
     if not tree.is_group(""):
         raise TacpipeError(f"{path} is not a Zarr group: it has no .zgroup or zarr.json of one at its top.")

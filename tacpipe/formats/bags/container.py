@@ -8,11 +8,10 @@ are derived from. The metadata record ``tacpipe`` contains the attributes.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, cast
@@ -26,12 +25,14 @@ from tacpipe.formats.bags.headers import APART_NS, MIN_BLOCKS, USE_LOG
 from tacpipe.formats.bags.images import declare_images
 from tacpipe.formats.bags.ros_files import BagDamage, BagMessage, Metadata, Record, TopicConnection
 from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
-from tacpipe.formats.container import Batched, EpisodeContents, SourceStream, Time
+from tacpipe.formats.container import Batched, Container, EpisodeContents, SourceStream, Time
+from tacpipe.formats.faults import explaining
 from tacpipe.io import config_text, regular
 from tacpipe.io import files as file_system
+from tacpipe.io.config_text import plain_value
 from tacpipe.io.spill import Spill, unpack
 from tacpipe.plugins import extras
-from tacpipe.plugins.stage import Attribute, Values
+from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
 EXPORT_KEY = "tacpipe"  # key in a channel's metadata, and name of the metadata record
@@ -49,7 +50,7 @@ class ExportedStream:
 
 def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
     """Return the stream that a channel's metadata describe, or None if tacpipe did not write them."""
-    description = _json_object(metadata.get(EXPORT_KEY, ""))
+    description = container.json_object(metadata.get(EXPORT_KEY, ""))
     if "derived_from" in description:
         return ExportedStream("", True, {}, {})
     try:
@@ -59,16 +60,6 @@ def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
         return ExportedStream(str(description["stream"]), False, columns, _texts(description.get("time", {})))
     except (KeyError, TypeError, AttributeError):
         return None
-
-
-def exported_attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
-    """Return the attributes in the metadata record ``values`` of an export."""
-    attributes = _json_object(values.get("attributes", ""))
-    return {
-        str(name): value
-        for name, value in attributes.items()
-        if value is None or isinstance(value, str | int | float | bool)
-    }
 
 
 def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStream:
@@ -85,22 +76,9 @@ def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStre
             HEADER,
         ):  # exported log times equal the header stamps; a stamp of 0 counts as unset
             fields[column.name] = column
-    schema = pa.schema(list(fields.values()))
-
-    def rename(table: pa.Table) -> pa.Table:
-        return pa.table([table.column(name) for name in fields], schema)
-
-    content = stream.content.mapped(schema, rename) if isinstance(stream.content, Batched) else rename(stream.content)
+    assert isinstance(stream.content, Batched)
+    content = stream.content.with_fields(fields)
     return SourceStream(stream.source, stream.name, Time(HEADER, "ns"), content, stream.rows)
-
-
-def _json_object(text: str) -> Values:
-    """Return the JSON object in a text, or an empty object if it is none."""
-    try:
-        value = json.loads(text or "{}")
-    except (ValueError, RecursionError):
-        return {}
-    return value if isinstance(value, dict) else {}
 
 
 def _texts(values: Mapping[str, Attribute]) -> dict[str, str]:
@@ -119,14 +97,10 @@ ROS2_METADATA = "rosbag2"  # name of the metadata record that ROS 2 writes
 
 
 @dataclass(frozen=True)
-class Bag:
-    """A bag: one file, or a ROS 2 folder with ``metadata.yaml``."""
+class Bag(Container):
+    """A bag, which is one recording: one file, or a ROS 2 folder with ``metadata.yaml``."""
 
     path: Path
-
-    def episodes(self) -> Sequence[str]:
-        """Return an empty sequence, because a bag is one recording."""
-        return ()
 
     def look(self, episode: str | None) -> EpisodeContents:
         """Return the streams in the first `LOOK_MESSAGES` messages of each file."""
@@ -237,16 +211,10 @@ class BagDescription(TypedDict, total=False):
 
 def _read_description(path: Path) -> BagDescription:
     """Return the description of a bag in its ``metadata.yaml``. Raises `TacpipeError` if it has none."""
-    try:
-        value = config_text.load_yaml(
-            regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode()
-        )
-        description = value["rosbag2_bagfile_information"]
-        return cast("BagDescription", dict(description))
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise TacpipeError(
-            f"{path} does not describe a bag: {plain(str(error), 120)}. Without it the files next to it are read one by one."
-        ) from error
+    advice = ". Without it the files next to it are read one by one."
+    with explaining((ValueError, KeyError, TypeError, RecursionError), f"{path} does not describe a bag: ", advice):
+        content = regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES)
+        return cast("BagDescription", dict(config_text.load_yaml(content.decode())["rosbag2_bagfile_information"]))
 
 
 def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
@@ -260,12 +228,15 @@ def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
 
     folder = stack.enter_context(tempfile.TemporaryDirectory())
     unpacked_path = Path(folder, path.stem)
-    with regular.failing(path), regular.opened(path) as file, unpacked_path.open("wb") as out:
-        try:
-            with zstandard.ZstdDecompressor().stream_reader(file) as content:
-                unpack(iter(lambda: content.read(UNPACKED_BYTES), b""), out, path)
-        except zstandard.ZstdError as error:
-            raise TacpipeError(f"{path} cannot be unpacked: {plain(str(error), 80)}.") from error
+    damaged = explaining(zstandard.ZstdError, f"{path} cannot be unpacked: ")
+    with (
+        regular.failing(path),
+        regular.opened(path) as file,
+        unpacked_path.open("wb") as out,
+        damaged,
+        zstandard.ZstdDecompressor().stream_reader(file) as content,
+    ):
+        unpack(iter(lambda: content.read(UNPACKED_BYTES), b""), out, path)
     return unpacked_path
 
 
@@ -357,9 +328,8 @@ class _BagReading:
                 self.attributes["ros_distro"] = metadata.values["ros_distro"]
             return
         if metadata.name == EXPORT_KEY:
-            self.attributes |= exported_attributes(metadata.values)
+            self.attributes |= container.plain_values(container.json_object(metadata.values.get("attributes", "")))
             return
-        from tacpipe.io.config_text import plain_value
 
         for name, value in metadata.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))

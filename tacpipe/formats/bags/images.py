@@ -30,13 +30,9 @@ def declare_images(content: Batched, message_type: str) -> Batched:
 
 def _add_metadata(content: Batched, metadata: dict[str, str], omitted_columns: tuple[str, ...] = ()) -> Batched:
     """Return rows with metadata at the images and without some columns."""
-    fields = [
-        field.with_metadata({**(field.metadata or {}), **metadata}) if field.name == PICTURE else field
-        for field in content.schema
-        if field.name not in omitted_columns
-    ]
-    schema = pa.schema(fields)
-    return content.mapped(schema, lambda table: pa.table([table.column(field.name) for field in fields], schema))
+    fields = {field.name: field for field in content.schema if field.name not in omitted_columns}
+    image = fields[PICTURE]
+    return content.with_fields({**fields, PICTURE: image.with_metadata({**(image.metadata or {}), **metadata})})
 
 
 def _raw_images(content: Batched) -> Batched:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import struct
 import zlib
@@ -13,6 +12,7 @@ from typing import BinaryIO
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags.ros_files import (
     CUT_OFF,
+    PIECE_BYTES,
     BagDamage,
     BagMessage,
     BrokenRecordError,
@@ -20,7 +20,9 @@ from tacpipe.formats.bags.ros_files import (
     Metadata,
     Record,
     TopicConnection,
+    declares_too_much,
     format_time,
+    unpack_chunk,
 )
 from tacpipe.io import memory, regular
 from tacpipe.printable import plain
@@ -28,7 +30,6 @@ from tacpipe.printable import plain
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
-PIECE_BYTES = 1 << 20  # number of bytes read at once
 INDEX_ENTRY = 16  # size of a message's entry in a chunk index
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -192,10 +193,9 @@ class _RecordConverter:
         (length,) = struct.unpack_from("<I", content, _CHUNK.size)
         content_start = _CHUNK.size + 4 + length
         compression = bytes(content[_CHUNK.size + 4 : content_start]).decode(errors="replace")
-        if size > memory.MAX_BLOCK_BYTES:
-            problem = f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
+        if problem := declares_too_much(size):
             return LostChunk(problem, first_ns, last_ns)
-        unpacked = _decompress(compression, content[content_start + 8 :], size)
+        unpacked = unpack_chunk(compression, content[content_start + 8 :], size, "zstd or lz4")
         view = memoryview(unpacked)
         spans, end = _record_spans(view)
         if complete and (len(unpacked) != size or end != size or (check and zlib.crc32(unpacked) != check)):
@@ -234,31 +234,3 @@ def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
 def _attachment_name(content: bytes) -> str:
     """Return the name of an attachment, which follows two timestamps and the name's length."""
     return plain(content[20 : 20 + int.from_bytes(content[16:20], "little")].decode(errors="replace"))
-
-
-def _decompress(compression: str, content: bytes, size: int) -> bytes:
-    """Return the unpacked content of a chunk, up to ``size + 1`` bytes, or the part that can be unpacked.
-
-    Raises `BrokenRecordError` for an unknown compression.
-    """
-    if compression == "":
-        return content
-    if compression == "zstd":
-        import zstandard
-
-        source: BinaryIO = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(content))
-        damaged: tuple[type[Exception], ...] = (zstandard.ZstdError,)
-    elif compression == "lz4":
-        import lz4.frame
-
-        source = lz4.frame.LZ4FrameFile(io.BytesIO(content))
-        damaged = (RuntimeError, EOFError, OSError)
-    else:
-        raise BrokenRecordError(f"its chunks are compressed with {plain(compression)}, not zstd or lz4")
-    parts: list[bytes] = []
-    remaining = size + 1
-    with contextlib.suppress(*damaged):
-        while remaining and (part := source.read(min(remaining, PIECE_BYTES))):
-            parts.append(part)
-            remaining -= len(part)
-    return b"".join(parts)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from tacpipe.formats.bags.wire import TEXT, Leaf, MessageShape, Path
 
 MAX_COLUMNS = 4096  # byte arrays longer than this become one column of bytes
-_XYZ = ("x", "y", "z")
+_XYZ, _QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
 _STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))  # Foxglove messages and logs have no header
 _FRAMES = (("header", "frame_id"), ("frame_id",))
 
@@ -53,64 +53,35 @@ class Meaning:
     is_key: Callable[[Leaf], bool] = lambda leaf: False
 
 
-def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
-    """Return name, quantity, unit and component of a value by the enclosing message type and the value's path in it."""
-    meanings: dict[tuple[str, Path], tuple[str, str, str, str]] = {}
-
-    def add_vector(kind: str, path: Path, name: str, quantity: str, unit: str, parts: Sequence[str] = _XYZ) -> None:
-        for part in parts:
-            meanings[f"geometry_msgs/msg/{kind}", (*path, part)] = (
-                name.format(part),
-                quantity,
-                unit,
-                part,
-            )
-
-    add_vector("Wrench", ("force",), "force_{}_n", "force", "N")
-    add_vector("Wrench", ("torque",), "torque_{}_nm", "torque", "N m")
-    for kind, path in (("Pose", ("position",)), ("Transform", ("translation",)), ("PointStamped", ("point",))):
-        add_vector(kind, path, "position_{}_m", "position", "m")
-    quaternion = ("x", "y", "z", "w")
-    for kind, path in (
-        ("Pose", ("orientation",)),
-        ("Transform", ("rotation",)),
-        ("QuaternionStamped", ("quaternion",)),
-    ):
-        add_vector(kind, path, "orientation_{}", "orientation", "1", quaternion)
-    add_vector("Twist", ("linear",), "velocity_{}_m_s", "velocity", "m/s")
-    add_vector("Twist", ("angular",), "angular_velocity_{}_rad_s", "angular_velocity", "rad/s")
-    add_vector("Accel", ("linear",), "acceleration_{}_m_s2", "acceleration", "m/s^2")
-    add_vector("Accel", ("angular",), "angular_acceleration_{}_rad_s2", "angular_acceleration", "rad/s^2")
-    for part in quaternion:
-        meanings["sensor_msgs/msg/Imu", ("orientation", part)] = (
-            f"orientation_{part}",
-            "orientation",
-            "1",
-            part,
-        )
-    for part in _XYZ:
-        imu, magnetic_field = "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
-        name = f"angular_velocity_{part}_rad_s"
-        meanings[imu, ("angular_velocity", part)] = (name, "angular_velocity", "rad/s", part)
-        meanings[imu, ("linear_acceleration", part)] = (
-            f"acceleration_{part}_m_s2",
-            "acceleration",
-            "m/s^2",
-            part,
-        )
-        meanings[magnetic_field, ("magnetic_field", part)] = (
-            f"magnetic_field_{part}_t",
-            "magnetic_field",
-            "T",
-            part,
-        )
-    meanings["sensor_msgs/msg/Temperature", ("temperature",)] = ("temperature_degc", "temperature", "degC", "")
-    meanings["sensor_msgs/msg/FluidPressure", ("fluid_pressure",)] = ("pressure_pa", "static_pressure", "Pa", "")
-    meanings["sensor_msgs/msg/Range", ("range",)] = ("range_m", "proximity", "m", "")
-    return meanings
-
-
-_GEOMETRY = _geometry_meanings()
+_VECTORS = (  # message type, name of the vector in it, and column name, quantity, unit and components
+    ("geometry_msgs/msg/Wrench", "force", "force_{}_n", "force", "N", _XYZ),
+    ("geometry_msgs/msg/Wrench", "torque", "torque_{}_nm", "torque", "N m", _XYZ),
+    ("geometry_msgs/msg/Pose", "position", "position_{}_m", "position", "m", _XYZ),
+    ("geometry_msgs/msg/Transform", "translation", "position_{}_m", "position", "m", _XYZ),
+    ("geometry_msgs/msg/PointStamped", "point", "position_{}_m", "position", "m", _XYZ),
+    ("geometry_msgs/msg/Pose", "orientation", "orientation_{}", "orientation", "1", _QUATERNION),
+    ("geometry_msgs/msg/Transform", "rotation", "orientation_{}", "orientation", "1", _QUATERNION),
+    ("geometry_msgs/msg/QuaternionStamped", "quaternion", "orientation_{}", "orientation", "1", _QUATERNION),
+    ("geometry_msgs/msg/Twist", "linear", "velocity_{}_m_s", "velocity", "m/s", _XYZ),
+    ("geometry_msgs/msg/Twist", "angular", "angular_velocity_{}_rad_s", "angular_velocity", "rad/s", _XYZ),
+    ("geometry_msgs/msg/Accel", "linear", "acceleration_{}_m_s2", "acceleration", "m/s^2", _XYZ),
+    ("geometry_msgs/msg/Accel", "angular", "angular_acceleration_{}_rad_s2", "angular_acceleration", "rad/s^2", _XYZ),
+    ("sensor_msgs/msg/Imu", "orientation", "orientation_{}", "orientation", "1", _QUATERNION),
+    ("sensor_msgs/msg/Imu", "angular_velocity", "angular_velocity_{}_rad_s", "angular_velocity", "rad/s", _XYZ),
+    ("sensor_msgs/msg/Imu", "linear_acceleration", "acceleration_{}_m_s2", "acceleration", "m/s^2", _XYZ),
+    ("sensor_msgs/msg/MagneticField", "magnetic_field", "magnetic_field_{}_t", "magnetic_field", "T", _XYZ),
+)
+# name, quantity, unit and component of a value by the enclosing message type and the value's path in it
+_MEANINGS_BY_PATH: dict[tuple[str, Path], tuple[str, str, str, str]] = {
+    (kind, (vector, part)): (name.format(part), quantity, unit, part)
+    for kind, vector, name, quantity, unit, parts in _VECTORS
+    for part in parts
+}
+_MEANINGS_BY_PATH |= {
+    ("sensor_msgs/msg/Temperature", ("temperature",)): ("temperature_degc", "temperature", "degC", ""),
+    ("sensor_msgs/msg/FluidPressure", ("fluid_pressure",)): ("pressure_pa", "static_pressure", "Pa", ""),
+    ("sensor_msgs/msg/Range", ("range",)): ("range_m", "proximity", "m", ""),
+}
 
 
 def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
@@ -119,7 +90,7 @@ def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
     Returns None if no enclosing message has a type that defines the value.
     """
     for depth, kind in reversed(leaf.enclosing):
-        meaning = _GEOMETRY.get((kind, leaf.path[depth:]))
+        meaning = _MEANINGS_BY_PATH.get((kind, leaf.path[depth:]))
         if meaning is not None:
             return *meaning, depth
     return None

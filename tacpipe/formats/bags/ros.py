@@ -96,34 +96,24 @@ class RosDecoder:
                     [messages[row] for row in chosen.tolist()] if len(chosen) < len(messages) else messages
                 )
                 self._replace_wrong_definition(bytes(chosen_messages[0]), encoding)
-                single: dict[Any, _SingleMessages] = {}
+                packed: dict[Any, _PackedMessages] = {}
                 for shape, rows, matrix in wire.group_by_shape(
                     chosen_messages, self.types, self.name, encoding, known_shapes
                 ):
                     if len(rows) == 1:
                         # the shape may come from an earlier message
                         own_shape = replace(shape, first=matrix[0].tobytes())
-                        self._add_single(own_shape, int(chosen[rows[0]]), meaning, single)
+                        keys = [own_shape.bytes_of(leaf) for leaf in shape.leaves if meaning.is_key(leaf)]
+                        group = (tuple(shape.counts), tuple(keys))
+                        packed.setdefault(group, _PackedMessages(own_shape)).add(own_shape, int(chosen[rows[0]]))
                         continue
                     for same, message in _split_by_keys(shape, matrix, meaning):
-                        yield from _decode_matrix(message, chosen[rows[same]], matrix[same], meaning)
-                for single_messages in single.values():
-                    yield from single_messages.blocks()
+                        yield from _decode_matrix(message, chosen[rows[same]], matrix[same], meaning.parts(message), {})
+                for messages_of_leaves in packed.values():
+                    yield from messages_of_leaves.blocks(meaning)
                 del known_shapes[MAX_SHAPES:]
         except wire.WireError as error:
             raise TopicError(str(error)) from error
-
-    def _add_single(
-        self, shape: MessageShape, row: int, meaning: meanings.Meaning, single: dict[Any, _SingleMessages]
-    ) -> None:
-        """Add a message with a unique shape to the messages in ``single`` that have the same leaves and keys."""
-        keys = tuple(
-            shape.first[leaf.offset : leaf.offset + leaf.size] for leaf in shape.leaves if meaning.is_key(leaf)
-        )
-        group = (tuple(shape.counts), keys)
-        if group not in single:
-            single[group] = _SingleMessages.from_shape(shape, meaning)
-        single[group].add(shape, row)
 
     def _replace_wrong_definition(self, message: bytes, encoding: Encoding) -> None:
         """Use ROS's own definition of the type if the file's does not match ``message``.
@@ -140,57 +130,38 @@ class RosDecoder:
 
 
 @dataclass
-class _SingleMessages:
-    """Messages with the same leaves but different string lengths, decoded value by value."""
+class _PackedMessages:
+    """Messages with the same leaves but different text lengths: a matrix of their numbers, and their texts."""
 
-    parts: list[meanings.MessagePart]
-    leaves: dict[Leaf, int]  # position of each leaf
+    first: MessageShape
     rows: list[int] = field(default_factory=list)
-    values: list[list[list[Any]]] = field(default_factory=list)  # (part, column, message)
-
-    @classmethod
-    def from_shape(cls, shape: MessageShape, meaning: meanings.Meaning) -> _SingleMessages:
-        """Return an empty collection for messages with the leaves of a shape."""
-        parts = [part for part in meaning.parts(shape) if part.columns]
-        for part in parts:
-            part.columns = [*_header_columns(part), *part.columns]
-        leaves = {leaf: position for position, leaf in enumerate(shape.leaves)}
-        return cls(parts, leaves, [], [[[] for _ in part.columns] for part in parts])
+    numbers: list[bytes] = field(default_factory=list)
+    texts: list[list[str]] = field(default_factory=list)  # texts of each message
 
     def add(self, shape: MessageShape, row: int) -> None:
-        """Add the values of a message."""
+        """Add a message."""
         self.rows.append(row)
-        for part, values in zip(self.parts, self.values, strict=True):
-            for column, cells in zip(part.columns, values, strict=True):
-                cells.append(shape.value(shape.leaves[self.leaves[column.leaf]], column.index))
+        self.numbers.append(b"".join(shape.bytes_of(leaf) for leaf in shape.leaves if leaf.kind != TEXT))
+        self.texts.append([shape.text(leaf) for leaf in shape.leaves if leaf.kind == TEXT])
 
-    def blocks(self) -> Iterator[Block]:
-        """Yield one block of columns for each part of the message."""
-        for part, values in zip(self.parts, self.values, strict=True):
-            columns: dict[str, pa.Array] = {}
-            about: dict[str, Mapping[str, str]] = {}
-            for column, cells in zip(part.columns, values, strict=True):
-                name = _free_name(column.name, columns)
-                columns[name] = pa.array(cells, _column_type(column))
-                if column.name not in (HEADER, FRAME):
-                    about[name] = dict(column.about)
-            yield Block(part.suffix, np.array(self.rows), columns, about)
-
-
-def _header_columns(part: meanings.MessagePart) -> list[PartColumn]:
-    """Return the columns of a part's header."""
-    header_leaves = [(HEADER, part.stamp), (FRAME, part.frame)]
-    return [PartColumn(name, leaf) for name, leaf in header_leaves if leaf is not None]
-
-
-def _column_type(column: PartColumn) -> pa.DataType:
-    """Return the type of a column: text, stamps in ns, bytes, or numbers."""
-    leaf = column.leaf
-    if leaf.kind in (TEXT, "stamp"):
-        return pa.string() if leaf.kind == TEXT else pa.int64()
-    if column.index is None and leaf.count is not None:
-        return pa.binary()
-    return pa.bool_() if leaf.kind == "bool" else pa.from_numpy_dtype(np.dtype(wire.NUMBERS[leaf.kind]))
+    def blocks(self, meaning: meanings.Meaning) -> Iterator[Block]:
+        """Yield one block of columns for each part of the messages."""
+        texts = iter(zip(*self.texts, strict=True))
+        arrays: dict[wire.Path, Any] = {}
+        leaves: dict[Leaf | None, Leaf] = {}  # leaves of the matrix by leaf of the first message
+        offset = 0
+        for leaf in self.first.leaves:
+            leaves[leaf] = replace(leaf, offset=offset)
+            if leaf.kind == TEXT:
+                arrays[leaf.path] = pa.array(next(texts), pa.string())
+            else:
+                offset += leaf.size
+        parts = meaning.parts(self.first)
+        for part in parts:
+            part.columns = [replace(column, leaf=leaves[column.leaf]) for column in part.columns]
+            part.stamp, part.frame = leaves.get(part.stamp), leaves.get(part.frame)
+        matrix = np.frombuffer(b"".join(self.numbers), np.uint8).reshape(len(self.rows), offset)
+        yield from _decode_matrix(self.first, np.array(self.rows), matrix, parts, arrays)
 
 
 def _free_name(name: str, columns: Collection[str]) -> str:
@@ -217,36 +188,43 @@ def _split_by_keys(
 
 
 def _decode_matrix(
-    shape: MessageShape, rows: np.ndarray[Any, np.dtype[np.int64]], matrix: Matrix, meaning: meanings.Meaning
+    shape: MessageShape,
+    rows: np.ndarray[Any, np.dtype[np.int64]],
+    matrix: Matrix,
+    parts: Sequence[meanings.MessagePart],
+    arrays: dict[wire.Path, Any],
 ) -> Iterator[Block]:
-    """Yield the block of each part of messages (message, byte) of one shape; ``rows`` are their positions in the batch."""
-    cache: dict[int, Any] = {}  # values by leaf offset, so that an array is read once for all of its columns
-    for part in meaning.parts(shape):
-        columns: dict[str, pa.Array] = {}
+    """Yield the block of each part of messages (message, byte) of one shape; ``rows`` are their positions in the batch.
+
+    ``arrays`` has values by path of their leaf, so that an array is read once for all of its columns.
+    """
+    for part in parts:
+        header = [(HEADER, part.stamp), (FRAME, part.frame)]
+        columns = {
+            name: _column_array(shape, PartColumn(name, leaf), matrix, arrays)
+            for name, leaf in header
+            if leaf is not None
+        }
         about: dict[str, Mapping[str, str]] = {}
-        if part.stamp is not None:
-            columns[HEADER] = pa.array(shape.numbers(part.stamp, matrix))
-        if part.frame is not None:
-            columns[FRAME] = _text_array(part.frame, matrix)
         for column in part.columns:
             name = _free_name(column.name, columns)
-            columns[name] = _column_array(shape, column, matrix, cache)
+            columns[name] = _column_array(shape, column, matrix, arrays)
             about[name] = dict(column.about)
         if about:
             yield Block(part.suffix, rows, columns, about)
 
 
-def _column_array(shape: MessageShape, column: PartColumn, matrix: Matrix, cache: dict[int, Any]) -> pa.Array:
-    """Return a column of messages (message, byte). ``cache`` keeps the values of arrays by the offset of their leaf."""
+def _column_array(shape: MessageShape, column: PartColumn, matrix: Matrix, arrays: dict[wire.Path, Any]) -> pa.Array:
+    """Return a column of messages (message, byte). ``arrays`` keeps the values of each leaf by path."""
     leaf = column.leaf
     if leaf.kind == TEXT:
-        return _text_array(leaf, matrix)
+        return arrays[leaf.path] if leaf.path in arrays else _text_array(leaf, matrix)
     if column.index is None and leaf.count is not None:
         return _bytes_array(leaf, matrix)
-    if leaf.offset not in cache:
+    if leaf.path not in arrays:
         values = shape.numbers(leaf, matrix)
-        cache[leaf.offset] = values.T.copy() if values.ndim == 2 else values  # (position, message)
-    values = cache[leaf.offset] if column.index is None else cache[leaf.offset][column.index]
+        arrays[leaf.path] = values.T.copy() if values.ndim == 2 else values  # (position, message)
+    values = arrays[leaf.path] if column.index is None else arrays[leaf.path][column.index]
     return pa.array(values.astype(bool) if leaf.kind == "bool" else values)
 
 

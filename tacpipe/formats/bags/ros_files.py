@@ -13,19 +13,21 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 from urllib.parse import quote
 
 import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags import ros
+from tacpipe.formats.faults import explaining
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
+PIECE_BYTES = 1 << 20  # number of bytes read or unpacked at once
 CUT_OFF = "the file ends within a record: it was cut off, and what came after is missing"
 
 
@@ -99,6 +101,46 @@ def format_time(time_ns: int) -> str:
     return str(np.datetime_as_string(np.datetime64(time_ns, "ns"), unit="ms"))
 
 
+def declares_too_much(size: int) -> str:
+    """Return a problem that completes "a chunk …" if a chunk's unpacked ``size`` in bytes exceeds the limit, or ""."""
+    limit = memory.MAX_BLOCK_BYTES
+    return f"declares {size:,} bytes, more than the {limit:,} that are unpacked" if size > limit else ""
+
+
+def unpack_chunk(compression: str, content: bytes, size: int, accepted: str) -> bytes:
+    """Return the unpacked content of a chunk, up to ``size + 1`` bytes, or the part that can be unpacked.
+
+    Raises `BrokenRecordError` for a compression that is not one of ``accepted``, such as "zstd or lz4".
+    """
+    if not compression:
+        return content
+    if compression not in accepted.split(" or "):
+        raise BrokenRecordError(f"its chunks are compressed with {plain(compression)}, not {accepted}")
+    parts: list[bytes] = []
+    remaining = size + 1
+    if compression == "zstd":
+        import zstandard
+
+        source = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(content))
+        with contextlib.suppress(zstandard.ZstdError):
+            while remaining and (part := source.read(min(remaining, PIECE_BYTES))):
+                parts.append(part)
+                remaining -= len(part)
+        return b"".join(parts)
+    new_decompressor: Callable[[], Any] = bz2.BZ2Decompressor
+    if compression == "lz4":
+        import lz4.frame
+
+        new_decompressor = lz4.frame.LZ4FrameDecompressor
+    with contextlib.suppress(OSError, RuntimeError, EOFError):
+        while content and remaining:  # each time one of several frames
+            decompressor = new_decompressor()
+            parts.append(bytes(decompressor.decompress(content, remaining)))
+            remaining -= len(parts[-1])
+            content = decompressor.unused_data or b"" if decompressor.eof else b""
+    return b"".join(parts)
+
+
 Record: TypeAlias = TopicConnection | BagMessage | Metadata | BagDamage
 
 _ERRORS = (sqlite3.Error, UnicodeDecodeError)  # UnicodeDecodeError: an SQLite message may quote damaged text
@@ -112,11 +154,9 @@ def read_sqlite_records(path: Path) -> Iterator[Record]:
     if magic != SQLITE_MAGIC:
         raise TacpipeError(f"{path} is not a SQLite file: it {'does not begin as one' if magic else 'is empty'}.")
     with _connect(path) as connection:
-        try:
+        with explaining(_ERRORS, f"{path} is not a bag of ROS 2: "):
             _expect_tables(path, connection)
             yield from _read_channels(connection)
-        except _ERRORS as error:
-            raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
         try:
             for number, log_ns, content in connection.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
@@ -224,7 +264,7 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
             raise BrokenRecordError("a chunk lies within a chunk")
         if kind == CHUNK:
             content, complete = _read_content(file, size)
-            unpacked, problem = _decompress(header.get("compression", b"none"), content, _field_number(header, "size"))
+            unpacked, problem = _unpack(header, content)
             read_records = _read_records(path, io.BytesIO(unpacked), len(unpacked), within_chunk=True)
             if not complete:
                 yield from read_records
@@ -246,6 +286,16 @@ def _read_records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool =
         yield BagMessage(number, log_ns, log_ns, content)
     if lost is not None:
         yield lost.damage(path)
+
+
+def _unpack(header: dict[str, bytes], content: bytes) -> tuple[bytes, str]:
+    """Return the intact part of a chunk's unpacked content, and a problem that completes "a chunk …", or ""."""
+    size = _field_number(header, "size")
+    if problem := declares_too_much(size):
+        return b"", problem
+    compression = header.get("compression", b"none").decode(errors="replace")
+    unpacked = unpack_chunk("" if compression == "none" else compression, content, size, "bz2 or lz4")
+    return unpacked, "" if len(unpacked) == size else f"of {size:,} bytes is damaged"
 
 
 def _count_lost_messages(lost: LostChunk, index: bytes) -> None:
@@ -328,26 +378,3 @@ def _read_length(file: BinaryIO) -> int:
     if len(word) < 4:
         raise BrokenRecordError(CUT_OFF)
     return int.from_bytes(word, "little")
-
-
-def _decompress(compression: bytes, content: bytes, size: int) -> tuple[bytes, str]:
-    """Return the intact part of a chunk's unpacked content, and a problem that completes "a chunk …", or "".
-
-    Raises `BrokenRecordError` for an unknown compression.
-    """
-    if size > memory.MAX_BLOCK_BYTES:
-        return b"", f"declares {size:,} bytes, more than the {memory.MAX_BLOCK_BYTES:,} that are unpacked"
-    unpacked = content
-    try:
-        if compression == b"bz2":
-            unpacked = bz2.BZ2Decompressor().decompress(content, size + 1)
-        elif compression == b"lz4":
-            import lz4.frame
-
-            unpacked = bytes(lz4.frame.LZ4FrameDecompressor().decompress(content, size + 1))
-        elif compression != b"none":
-            name = plain(compression.decode(errors="replace"))
-            raise BrokenRecordError(f"its chunks are compressed with {name}, not bz2 or lz4")
-    except (OSError, RuntimeError, EOFError):
-        unpacked = b""
-    return unpacked, "" if len(unpacked) == size else f"of {size:,} bytes is damaged"

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 
 from tacpipe.arrays import Int64s
 from tacpipe.formats.bags.headers import HeaderStamps
-from tacpipe.formats.container import Batched, Time
+from tacpipe.formats.container import Batched, Time, json_object
 from tacpipe.io import spill
 from tacpipe.io.spill import Piece, Spill
 from tacpipe.plugins.stage import Values
@@ -357,15 +357,9 @@ class Json:
 
     def _base64_properties(self) -> set[str]:
         """Return the names of the properties that the schema declares as base64; an empty set without a valid schema."""
-        try:
-            schema = json.loads(self.schema or "{}")
-            return {
-                name
-                for name, property_schema in schema["properties"].items()
-                if property_schema.get("contentEncoding") == "base64"
-            }
-        except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
-            return set()
+        properties = json_object(self.schema).get("properties")
+        named = properties.items() if isinstance(properties, dict) else ()
+        return {name for name, about in named if isinstance(about, dict) and about.get("contentEncoding") == "base64"}
 
 
 def _build_object(pairs: Sequence[tuple[str, Any]]) -> Values:

@@ -23,10 +23,6 @@ NUMBERS = {
     **{"bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"},
 }
-_CODES = {  # codes of `struct`, whose "l" has four bytes; numpy's has eight
-    name: ({"i8": "q", "u8": "Q"}.get(kind, np.dtype(kind).char), np.dtype(kind).itemsize)
-    for name, kind in NUMBERS.items()
-}
 STAMPS = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 TEXT = "text"
 MAX_LEAVES = 1 << 16  # maximum number of values per message
@@ -92,20 +88,11 @@ class MessageShape:
 
     def text(self, leaf: Leaf) -> str:
         """Return a text in the first message."""
-        return self.first[leaf.offset : leaf.offset + (leaf.count or 0)].decode(errors="replace")
+        return self.bytes_of(leaf).decode(errors="replace")
 
-    def value(self, leaf: Leaf, index: int | None) -> Any:
-        """Return a value in the first message: a text, a number, an array element, a stamp in nanoseconds, or bytes."""
-        if leaf.kind == TEXT:
-            return self.text(leaf)
-        if leaf.kind == "stamp":
-            seconds, nanoseconds = struct.unpack_from(f"{self.encoding.order}iI", self.first, leaf.offset)
-            return seconds * 10**9 + nanoseconds
-        if index is None and leaf.count is not None:
-            return self.first[leaf.offset : leaf.offset + leaf.size]
-        code, width = _CODES[leaf.kind]
-        (number,) = struct.unpack_from(f"{self.encoding.order}{code}", self.first, leaf.offset + (index or 0) * width)
-        return bool(number) if leaf.kind == "bool" else number
+    def bytes_of(self, leaf: Leaf) -> bytes:
+        """Return the bytes of a value in the first message."""
+        return self.first[leaf.offset : leaf.offset + leaf.size]
 
     def number(self, leaf: Leaf) -> int:
         """Return an integer in the first message."""

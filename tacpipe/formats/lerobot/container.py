@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from tacpipe.arrays import Bools, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
-from tacpipe.formats.container import Batched, EpisodeContents, Share, SourceStream, Time
+from tacpipe.formats.container import Batched, Container, EpisodeContents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import EpisodeDescription, FeatureDescription, LeRobotDescription
 from tacpipe.formats.table.column_names import NO_MEANING, meaning_from_name, meanings
@@ -51,7 +51,7 @@ def _scan_video(path: Path, changed_ns: int) -> VideoScan:
     return scan(path)
 
 
-class LeRobotContainer:
+class LeRobotContainer(Container):
     """A LeRobot dataset."""
 
     def __init__(self, path: Path) -> None:
@@ -347,11 +347,6 @@ class LeRobotContainer:
         return [pa.array(np.ascontiguousarray(flat[:, position])) for position in range(feature.width)]
 
 
-def open_lerobot(path: Path) -> LeRobotContainer:
-    """Return the dataset in the folder ``path``."""
-    return LeRobotContainer(path)
-
-
 @contextlib.contextmanager
 def _advise_copy(path: Path) -> Iterator[None]:
     """Add the advice to copy the file again to errors in the block."""
@@ -391,7 +386,7 @@ def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
 def _values_error(path: Path, key: str, values: pa.ChunkedArray, width: int) -> TacpipeError:
     """Return the error for the first frame (counted from 0) with a null or another number of values than ``width``."""
     for frame, entry in enumerate(values.to_pylist()):
-        leaves = list(_leaves(entry))
+        leaves = description.leaves(entry)
         if None in leaves:
             place = f", value {leaves.index(None)}," if isinstance(entry, list) else ""
             return TacpipeError(f"{path}: frame {frame}{place} of {plain(key)} is null (counted from 0). {WRITE_AGAIN}")
@@ -401,15 +396,6 @@ def _values_error(path: Path, key: str, values: pa.ChunkedArray, width: int) -> 
         f"{path}: frame {frame} of {plain(key)} (counted from 0) has {len(leaves)} values, and {description.INFO} states "
         f"{width}. {WRITE_AGAIN}"
     )
-
-
-def _leaves(value: object) -> Iterator[object]:
-    """Yield the values in nested lists."""
-    if isinstance(value, list):
-        for inner in value:
-            yield from _leaves(inner)
-    else:
-        yield value
 
 
 def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.arrays.tree import plain_attributes
+from tacpipe.formats.faults import explaining
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, parquet, regular
 from tacpipe.io.parquet import BROKEN
@@ -118,19 +119,10 @@ class LeRobotDescription:
             index, length = entry.get("episode_index"), entry.get("length")
             if not isinstance(index, int) or not isinstance(length, int):
                 raise TacpipeError(f"{path}: {excerpt(entry)} has no whole numbers episode_index and length.")
-            values = {"episode_chunk": index // size, "episode_index": index}
-            extra_values = {
-                key: value for key, value in entry.items() if key not in ("episode_index", "length", "tasks")
-            }
-            yield EpisodeDescription(
-                _episode_name(index, extra_values),
-                index,
-                self._format_path("data_path", DATA_PATHS["v2"], values),
-                length,
-                tuple(map(str, entry.get("tasks") or ())),
-                {key: self._format_path("video_path", "", {**values, "video_key": key}) for key in self._videos},
-                _plain_attributes(extra_values),
-            )
+            numbers = {"episode_chunk": index // size, "episode_index": index}
+            videos = {key: self._format_path("video_path", "", {**numbers, "video_key": key}) for key in self._videos}
+            file = self._format_path("data_path", DATA_PATHS["v2"], numbers)
+            yield _describe_episode(index, length, file, entry, videos)
 
     def _episodes_from_parquet(self) -> Iterator[EpisodeDescription]:
         """Yield the episodes of a dataset of version 3, from ``meta/episodes``.
@@ -161,11 +153,6 @@ class LeRobotDescription:
                 f"{path}: a row has no whole number {plain(str(error).strip(chr(39)))}; it names episode_index, length, "
                 f"data/chunk_index and data/file_index."
             ) from error
-        extra_values = {
-            key: value
-            for key, value in row.items()
-            if key not in ("episode_index", "length", "tasks") and not key.startswith(LOCATION_PREFIXES)
-        }
         videos = {}
         starts_s = {}
         for key in self._videos:
@@ -175,19 +162,9 @@ class LeRobotDescription:
                 start_s = row.get(f"videos/{key}/from_timestamp")
                 starts_s[key] = float(start_s) if isinstance(start_s, int | float) else 0.0
         file = self._format_path("data_path", DATA_PATHS["v3"], values)
-        tasks = tuple(map(str, row.get("tasks") or ()))
-        original = _original_attributes(path, row.get(ATTRIBUTES))
-        return EpisodeDescription(
-            _episode_name(index, extra_values),
-            index,
-            file,
-            length,
-            tasks,
-            videos,
-            _plain_attributes(extra_values),
-            original,
-            starts_s,
-        )
+        stated = {key: value for key, value in row.items() if not key.startswith(LOCATION_PREFIXES)}
+        episode = _describe_episode(index, length, file, stated, videos)
+        return replace(episode, original=_original_attributes(path, row.get(ATTRIBUTES)), video_starts_s=starts_s)
 
     @property
     def _videos(self) -> list[str]:
@@ -235,17 +212,11 @@ def read_description(root: Path) -> LeRobotDescription:
 @contextlib.contextmanager
 def parquet_errors(path: Path) -> Iterator[None]:
     """Raise errors of pyarrow and the system in the block as a `TacpipeError` with the file's name."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise TacpipeError(f"{path} is not there, and the dataset names it. Copy the dataset again.") from error
-    except BROKEN as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            with regular.failing(path):
-                raise
-        raise TacpipeError(
-            f"{path} is not a whole Parquet file: {plain(' '.join(str(error).split()), 200)}. Copy it again."
-        ) from error
+    with explaining(BROKEN, f"{path} is not a whole Parquet file: ", ". Copy it again.", path=path):
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise TacpipeError(f"{path} is not there, and the dataset names it. Copy the dataset again.") from error
 
 
 def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescription:
@@ -264,8 +235,8 @@ def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescr
     exported = about if isinstance(about, dict) else {}
 
     def texts_per_value(texts: Any) -> tuple[str, ...]:
-        leaves = _leaves(texts)
-        return tuple(leaves) if len(leaves) == feature.width else ()
+        names = [str(name) for name in leaves(texts) if name is not None]
+        return tuple(names) if len(names) == feature.width else ()
 
     names = texts_per_value(exported.get("columns")) or texts_per_value(value.get("names"))
     unique = names if len(set(names)) == len(names) else ()
@@ -277,30 +248,32 @@ def _parse_feature(path: Path, key: str, value: Any, about: Any) -> FeatureDescr
     )
 
 
-def _leaves(names: Any) -> list[str]:
-    """Return the names in an arbitrarily nested structure.
+def leaves(nested: Any) -> list[Any]:
+    """Return the values in arbitrarily nested lists and mappings.
 
-    >>> _leaves({"motors": ["a", "b"]}), _leaves([["x"], ["y"]]), _leaves(None)
-    (['a', 'b'], ['x', 'y'], [])
+    >>> leaves({"motors": ["a", "b"]}), leaves([["x"], ["y"]]), leaves(None)
+    (['a', 'b'], ['x', 'y'], [None])
     """
-    leaves: list[str] = []
-    pending = [names]
+    values: list[Any] = []
+    pending = [nested]
     while pending:  # a loop, because deep nesting would exceed the recursion limit
         value = pending.pop()
         if isinstance(value, dict | list):
             pending += reversed(list(value.values()) if isinstance(value, dict) else value)
-        elif value is not None:
-            leaves.append(str(value))
-    return leaves
+        else:
+            values.append(value)
+    return values
 
 
-def _episode_name(index: int, extra_values: Mapping[str, Attribute]) -> str:
-    return str(extra_values[NAME]) if extra_values.get(NAME) else f"episode_{index:06d}"
-
-
-def _plain_attributes(values: Mapping[str, Attribute]) -> dict[str, Attribute]:
-    extra_values = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
-    return dict(plain_attributes(extra_values))
+def _describe_episode(
+    index: int, length: int, file: str, values: Values, videos: Mapping[str, str]
+) -> EpisodeDescription:
+    """Return the description of an episode; further ``values`` of its entry in meta are its attributes."""
+    name = str(values[NAME]) if values.get(NAME) else f"episode_{index:06d}"
+    own_keys = ("episode_index", "length", "tasks", NAME, ATTRIBUTES)
+    attributes = plain_attributes({key: value for key, value in values.items() if key not in own_keys})
+    tasks = tuple(map(str, values.get("tasks") or ()))
+    return EpisodeDescription(name, index, file, length, tasks, videos, attributes)
 
 
 def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
@@ -314,8 +287,7 @@ def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
         attributes = container.json_value(text, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
-    values = attributes.items() if isinstance(attributes, dict) else ()
-    return {str(key): value for key, value in values if value is None or isinstance(value, str | int | float | bool)}
+    return container.plain_values(attributes if isinstance(attributes, dict) else {})
 
 
 def _format_number(value: object, width: str | None) -> str:
@@ -327,10 +299,8 @@ def _read_json(root: Path, name: str) -> Any:
     path = regular.inside(root, name)
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
-    try:
+    with explaining((ValueError, RecursionError), f"{path} is not JSON: ", ". Copy it again."):
         content_json = container.json_value(content, path)
-    except (ValueError, RecursionError) as error:
-        raise TacpipeError(f"{path} is not JSON: {plain(str(error), 200)}. Copy it again.") from error
     if not isinstance(content_json, dict):
         raise TacpipeError(f"{path} holds {excerpt(content_json)}; it must be a JSON object.")
     return content_json
@@ -343,12 +313,8 @@ def _read_json_lines(path: Path) -> Iterator[Values]:
     for number, line in enumerate(content.splitlines(), 1):
         if not line.strip():
             continue
-        try:
+        with explaining((ValueError, RecursionError), f"{path}, line {number} is not JSON: ", ". Copy the file again."):
             entry = container.json_value(line, path)
-        except (ValueError, RecursionError) as error:
-            raise TacpipeError(
-                f"{path}, line {number} is not JSON: {plain(str(error), 200)}. Copy the file again."
-            ) from error
         if not isinstance(entry, dict):
             raise TacpipeError(f"{path}, line {number} holds {excerpt(entry)}; it must be a JSON object.")
         yield entry

@@ -6,7 +6,6 @@ import contextlib
 import functools
 import itertools
 import math
-import re
 import sys
 import zipfile
 import zlib
@@ -24,7 +23,9 @@ import pyarrow.parquet as pq
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.container import Batched, SourceStream, Time
+from tacpipe.formats.faults import explaining
 from tacpipe.formats.table import text
+from tacpipe.formats.table.columns import RowFile
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
@@ -40,23 +41,19 @@ MAX_COLUMNS = 1 << 20  # maximum number of columns per array
 MAX_PIXELS = 1 << 28  # maximum number of values per decoded image
 STREAM_COLUMNS = 4096  # maximum number of values per row of an array that is guessed to be channels
 MAX_LINE_BYTES = 1 << 26  # maximum size of a JSON object
-_NOT_BLANK = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
 
 
 @dataclass(frozen=True)
-class ParquetFile:
+class ParquetFile(RowFile):
     """A Parquet file from any source; reading a nested column raises an error."""
 
     path: Path
 
     def names(self) -> list[str]:
         """Return the names of the columns. Raises `TacpipeError` if the file is not Parquet."""
-        try:
-            with regular.opened(self.path) as file:
-                return list(pq.ParquetFile(file).schema_arrow.names)
-        except BROKEN as error:
-            raise TacpipeError(f"{self.path} is not a Parquet file: {plain(str(error), 200)}.") from error
+        with explaining(BROKEN, f"{self.path} is not a Parquet file: "), regular.opened(self.path) as file:
+            return list(pq.ParquetFile(file).schema_arrow.names)
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns in ``types`` in blocks of rows, with the types of the file.
@@ -71,13 +68,9 @@ class ParquetFile:
                 for batch in opened.iter_batches(rows, columns=list(types)):
                     yield _refuse_nested(self.path, pa.Table.from_batches([batch]))
 
-    def place(self, index: int) -> str:
-        """Return the name of the data row ``index`` (from 0) in errors."""
-        return f"row {index + 1}"
-
 
 @dataclass(frozen=True)
-class NumpyArchive:
+class NumpyArchive(RowFile):
     """An NPZ archive: arrays (time,) are columns; an array (time, n, …) is n columns NAME_0, NAME_1, …."""
 
     path: Path
@@ -93,17 +86,8 @@ class NumpyArchive:
         arrays = {name: array for name, array in self._arrays.items() if name in array_names}
         rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
         self._expect_same_length(arrays)
-        with contextlib.ExitStack() as stack, self._convert_errors():
-            archive = stack.enter_context(self._archive())
-            readers = {name: stack.enter_context(array.reading(archive)) for name, array in arrays.items()}
-            count = next((array.rows for array in arrays.values()), 0)
-            for start in range(0, count, rows) if count else (0,):
-                blocks = {name: read(min(rows, count - start)) for name, read in readers.items()}
-                yield pa.table({name: _column(blocks, *self._column_sources[name]) for name in types})
-
-    def place(self, index: int) -> str:
-        """Return the name of the data row ``index`` (from 0) in errors."""
-        return f"row {index + 1}"
+        for blocks in self._blocks(arrays, rows):
+            yield pa.table({name: _column(blocks, *self._column_sources[name]) for name in types})
 
     @functools.cached_property
     def _column_sources(self) -> dict[str, tuple[str, int | None]]:
@@ -146,14 +130,10 @@ class NumpyArchive:
         rows = max(1, BLOCK_BYTES // max(1, images.row_bytes))
 
         def read() -> Iterator[pa.Table]:
-            with contextlib.ExitStack() as stack, self._convert_errors():
-                archive = stack.enter_context(self._archive())
-                readers = {name: stack.enter_context(member.reading(archive)) for name, member in arrays.items()}
-                for start in range(0, images.rows, rows):
-                    blocks = {name: read_rows(min(rows, images.rows - start)) for name, read_rows in readers.items()}
-                    pixels = raw_images(blocks[array].reshape(-1, *images.row_shape))
-                    stamps = [_column(blocks, clock, None)] if clock else []
-                    yield pa.table([*stamps, pa.array(pixels, pa.binary())], schema)
+            for blocks in self._blocks(arrays, rows):
+                pixels = raw_images(blocks[array].reshape(-1, *images.row_shape))
+                stamps = [_column(blocks, clock, None)] if clock else []
+                yield pa.table([*stamps, pa.array(pixels, pa.binary())], schema)
 
         return SourceStream(array, array, Time(column=clock), Batched(schema, images.rows, read), images.rows)
 
@@ -168,8 +148,19 @@ class NumpyArchive:
             ]
         return container.parts_by_name(((array.name, array) for array in members if array.shape), self.path, "array")
 
-    def _archive(self) -> contextlib.AbstractContextManager[Archive]:
-        return _zip_archive(self.path)
+    def _blocks(self, arrays: Mapping[str, ArrayMember], rows: int) -> Iterator[dict[str, np.ndarray]]:
+        """Yield up to ``rows`` rows of arrays of one length at a time; an empty block if there is no row."""
+        with contextlib.ExitStack() as stack, self._convert_errors():
+            archive = stack.enter_context(self._archive())
+            readers = {name: stack.enter_context(array.reading(archive)) for name, array in arrays.items()}
+            count = next((array.rows for array in arrays.values()), 0)
+            for start in range(0, count, rows) if count else (0,):
+                yield {name: read(min(rows, count - start)) for name, read in readers.items()}
+
+    @contextlib.contextmanager
+    def _archive(self) -> Iterator[Archive]:
+        with regular.opened(self.path) as file, zipfile.ZipFile(file) as archive:
+            yield archive
 
     def _expect_same_length(self, arrays: Mapping[str, ArrayMember]) -> None:
         """Raise `TacpipeError` if arrays of one stream have different numbers of rows."""
@@ -182,19 +173,16 @@ class NumpyArchive:
                 f"of one stream have one length. Skip those of another rate, and read them as a stream of their own."
             )
 
-    @contextlib.contextmanager
-    def _convert_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except _ZIP_ERRORS as error:
-            raise TacpipeError(f"{self.path} is not an archive of arrays: {plain(str(error), 200)}.") from error
+    def _convert_errors(self) -> contextlib.AbstractContextManager[None]:
+        return explaining(_ZIP_ERRORS, f"{self.path} is not an archive of arrays: ")
 
 
 class NumpyFile(NumpyArchive):
     """An .npy file, treated as an archive with one array that has the file's name."""
 
-    def _archive(self) -> contextlib.AbstractContextManager[Archive]:
-        return contextlib.nullcontext(_LoneArray(self.path))
+    @contextlib.contextmanager
+    def _archive(self) -> Iterator[Archive]:
+        yield _LoneArray(self.path)
 
 
 class Archive(Protocol):
@@ -327,19 +315,13 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
     return tuple(map(int, shape)), bool(is_fortran), dtype
 
 
-@contextlib.contextmanager
-def _zip_archive(path: Path) -> Iterator[Archive]:
-    with regular.opened(path) as file, zipfile.ZipFile(file) as archive:
-        yield archive
-
-
 def _column(blocks: Mapping[str, np.ndarray], array: str, position: int | None) -> pa.Array:
     values = blocks[array][:, position or 0]
     return pa.array(np.ascontiguousarray(values, values.dtype.newbyteorder("=")))
 
 
 @dataclass(frozen=True)
-class JsonLines:
+class JsonLines(RowFile):
     """A file with one JSON object per line; lists in it become columns NAME_0, NAME_1, …."""
 
     path: Path
@@ -378,38 +360,20 @@ class JsonLines:
         for block in self._blocks():
             self._add_widths(block, widths)
             schemas.append(self._split_lists(block.slice(0, 1)).schema)
-        try:
+        with explaining(pa.ArrowException, f"{self.path} is not JSON lines: "):
             full_schema = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
-        except pa.ArrowException as error:
-            raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
         return {field.name: field.type for field in full_schema}
 
     def _blocks(self) -> Iterator[pa.Table]:
         """Yield the lines as tables. Raises `TacpipeError` if a line is too long or not a JSON object."""
+        too_long = TacpipeError(f"{self.path} is not JSON lines: a line has over {MAX_LINE_BYTES} bytes.")
         with text.open_text(self.path) as file:
-            remainder = b""
-            while new := file.read(BLOCK_BYTES):
-                end = new.rfind(b"\n") + 1
-                if end:
-                    yield from self._parse_blocks(remainder, memoryview(new)[:end])
-                remainder = new[end:] if end else remainder + new
-                if len(remainder) > MAX_LINE_BYTES:
-                    raise TacpipeError(f"{self.path} is not JSON lines: a line has over {MAX_LINE_BYTES} bytes.")
-            yield from self._parse_blocks(remainder)
-
-    def _parse_blocks(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
-        """Yield one table of the lines in ``pieces``, or nothing if they are blank.
-
-        Raises `TacpipeError` if they are not JSON.
-        """
-        if not any(_NOT_BLANK.search(piece) for piece in pieces):
-            return
-        try:
-            table = pj.read_json(pa.BufferReader(owned(*pieces)), pj.ReadOptions(use_threads=False)).flatten()
-            table.column_names  # noqa: B018  (names that are not UTF-8 are found here)
-        except (pa.ArrowInvalid, OSError, UnicodeDecodeError) as error:
-            raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
-        yield table
+            for pieces in text.whole_lines(file, BLOCK_BYTES, MAX_LINE_BYTES, too_long):
+                with explaining((pa.ArrowInvalid, OSError, UnicodeDecodeError), f"{self.path} is not JSON lines: "):
+                    buffer = pa.BufferReader(owned(*pieces))
+                    table = pj.read_json(buffer, pj.ReadOptions(use_threads=False)).flatten()
+                    table.column_names  # noqa: B018  (names that are not UTF-8 are found here)
+                yield table
 
     def _add_widths(self, block: pa.Table, widths: dict[str, int]) -> None:
         """Add the length of the lists in each column to ``widths``.

@@ -192,6 +192,16 @@ def numbered_pattern(name: str) -> str:
     return re.sub(r"([A-Za-z_]{0,64}[ .]?)\d+", placeholder, name)
 
 
+def longer_axis(shape: Sequence[int]) -> int:
+    """Return the longest axis of an array if the first is so much shorter that it belongs to the sensor, else 0.
+
+    >>> longer_axis((18, 3, 400)), longer_axis((400, 18)), longer_axis((100, 500))
+    (2, 0, 0)
+    """
+    longest = shape.index(max(shape))
+    return longest if shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
+
+
 XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 
@@ -207,38 +217,25 @@ class ColumnMeaning:
 NO_MEANING = ColumnMeaning()
 _HAND = r"(?:.*[_./])?(?:eef?|ee|tcp|end_effector|hand|wrist|tool|robot|arm)[_./]?"
 _ANY = r"(?:.*[_./])?"
-_VECTORS: Sequence[tuple[str, int, Sequence[ColumnMeaning]]] = (  # name, width, and the meaning of each column
-    (rf"{_HAND}(?:pos|position|translation|xyz|trans)", 3, [ColumnMeaning("position", "m", axis) for axis in XYZ]),
-    (rf"{_ANY}robot\d+_eef_quat", 4, [ColumnMeaning("orientation", "1", part) for part in QUATERNION]),
-    (rf"{_ANY}(?:quat|quaternion|orientation|ori)", 4, [ColumnMeaning("orientation", "1")] * 4),
-    (rf"{_HAND}(?:vel_lin|lin_vel|linear_velocity)", 3, [ColumnMeaning("velocity", "m/s", axis) for axis in XYZ]),
-    (
-        rf"{_HAND}(?:vel_ang|ang_vel|angular_velocity)",
-        3,
-        [ColumnMeaning("angular_velocity", "rad/s", axis) for axis in XYZ],
-    ),
-    (
-        rf"{_ANY}(?:rot_axis_angle|axis_angle|rotation_vector|rotvec)",
-        3,
-        [ColumnMeaning("angle", "rad", axis) for axis in XYZ],
-    ),
-    (
-        rf"{_HAND}pose|{_ANY}demo_(?:start|end)_pose",
-        6,
-        [ColumnMeaning("position", "m", axis) for axis in XYZ] + [ColumnMeaning("angle", "rad", axis) for axis in XYZ],
-    ),
-    (
-        rf"{_HAND}pose",
-        7,
-        [ColumnMeaning("position", "m", axis) for axis in XYZ] + [ColumnMeaning("orientation", "1")] * 4,
-    ),
-    (rf"{_ANY}(?:force|forces)", 3, [ColumnMeaning("force", "N", axis) for axis in XYZ]),
-    (rf"{_ANY}(?:torque|torques|moment)", 3, [ColumnMeaning("torque", "N m", axis) for axis in XYZ]),
-    (
-        rf"{_ANY}(?:wrench|force_?torque|ft|ft_sensor)",
-        6,
-        [ColumnMeaning("force", "N", axis) for axis in XYZ] + [ColumnMeaning("torque", "N m", axis) for axis in XYZ],
-    ),
+
+
+def _vector(quantity: str, unit: str, components: Sequence[str] = XYZ) -> list[ColumnMeaning]:
+    return [ColumnMeaning(quantity, unit, component) for component in components]
+
+
+_UNNAMED_QUATERNION = _vector("orientation", "1", [""] * 4)  # of which parts may be in any order
+_VECTORS: Sequence[tuple[str, Sequence[ColumnMeaning]]] = (  # name, and the meaning of each column
+    (rf"{_HAND}(?:pos|position|translation|xyz|trans)", _vector("position", "m")),
+    (rf"{_ANY}robot\d+_eef_quat", _vector("orientation", "1", QUATERNION)),
+    (rf"{_ANY}(?:quat|quaternion|orientation|ori)", _UNNAMED_QUATERNION),
+    (rf"{_HAND}(?:vel_lin|lin_vel|linear_velocity)", _vector("velocity", "m/s")),
+    (rf"{_HAND}(?:vel_ang|ang_vel|angular_velocity)", _vector("angular_velocity", "rad/s")),
+    (rf"{_ANY}(?:rot_axis_angle|axis_angle|rotation_vector|rotvec)", _vector("angle", "rad")),
+    (rf"{_HAND}pose|{_ANY}demo_(?:start|end)_pose", _vector("position", "m") + _vector("angle", "rad")),
+    (rf"{_HAND}pose", _vector("position", "m") + _UNNAMED_QUATERNION),
+    (rf"{_ANY}(?:force|forces)", _vector("force", "N")),
+    (rf"{_ANY}(?:torque|torques|moment)", _vector("torque", "N m")),
+    (rf"{_ANY}(?:wrench|force_?torque|ft|ft_sensor)", _vector("force", "N") + _vector("torque", "N m")),
 )
 _ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # name, and the meaning for any width
     (rf"{_ANY}gripper[_./](?:qpos|qvel|pos|position|state|command|action)s?", ColumnMeaning("state")),
@@ -272,8 +269,8 @@ def meanings(name: str, width: int, are_integers: bool = False) -> list[ColumnMe
         return [NO_MEANING] * width
     if is_label(text):
         return [ColumnMeaning("label", "1")] * width
-    for pattern, pattern_width, column_meanings in _VECTORS:
-        if pattern_width == width and re.fullmatch(pattern, text):
+    for pattern, column_meanings in _VECTORS:
+        if len(column_meanings) == width and re.fullmatch(pattern, text):
             return list(column_meanings)
     if text.endswith(_UNREAL):
         return [NO_MEANING] * width

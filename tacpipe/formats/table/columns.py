@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -15,24 +14,15 @@ import pyarrow.compute as pc
 
 from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.container import natural_order
 from tacpipe.formats.table import pattern
-from tacpipe.formats.table.layout import ColumnRule, StreamLayout
+from tacpipe.formats.table.layout import ColumnRule, Kind, StreamLayout
 from tacpipe.printable import listed, plain
 
 TIME = "t_ns"
 MAX_EXACT = 2**53  # number up to which float64 holds all whole numbers
-TYPES = {
-    **{
-        name: getattr(pa, name)() for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
-    },
-    **{
-        "float32": pa.float32(),
-        "float64": pa.float64(),
-        "bool": pa.bool_(),
-        "text": pa.string(),
-        "binary": pa.binary(),
-    },
-}
+_SPECIAL_TYPES = {"bool": pa.bool_(), "text": pa.string()}  # types whose names in Arrow differ from those in a layout
+TYPES = {name: _SPECIAL_TYPES.get(name) or getattr(pa, name)() for name in get_args(Kind)}
 Declared = Mapping[str, pa.Field]  # field with type and metadata by column name
 NO_DECLARATION: Declared = {}
 
@@ -49,6 +39,22 @@ class ChosenColumn:
     def read_as(self) -> pa.DataType:
         """The type for parsing cells: 64 bits for floats, because they may be scaled."""
         return pa.float64() if pa.types.is_floating(self.field.type) else self.field.type
+
+
+class RowFile(Protocol):
+    """A file of rows, or a stream of rows in a container."""
+
+    path: Path
+
+    def names(self) -> list[str]:
+        """Return the names of the columns."""
+
+    def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
+        """Return the columns in ``types``, block by block."""
+
+    def place(self, index: int) -> str:
+        """Return the name of the row ``index`` (from 0) in errors."""
+        return f"row {index + 1}"
 
 
 class CellError(ValueError):
@@ -119,9 +125,9 @@ def _in_one_order(chosen_columns: Sequence[ChosenColumn], stream: StreamLayout) 
 
     def key(column: ChosenColumn) -> tuple[Any, ...]:
         texts = tuple((pattern.match(column.rule.match, column.name) or {}).values()) or (column.name,)
-        parts = [part for text in texts for part in re.findall(r"\d+|\D+", text.lower())]
-        order = [(int(part), "") if part.isdecimal() else (-1, "~" if part == "w" else part) for part in parts]
-        return ranks[column.rule], () if column.rule.shape else tuple(order)
+        parts = [part for text in texts for part in natural_order(text.lower())]
+        order = tuple((-1, "~") if part == (-1, "w") else part for part in parts)
+        return ranks[column.rule], () if column.rule.shape else order
 
     return sorted(chosen_columns, key=key)
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.container import (
-    KINDS,
+    Container,
     Share,
-    Sharing,
     container_files,
     describe_unread,
     find_containers,
@@ -22,7 +23,7 @@ from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
 from tacpipe.plugins import failures
 from tacpipe.plugins.constraints import TomlFile
-from tacpipe.plugins.stage import Files, P, R, RecordingOutput, Shared, Source, Stage, Values, stage
+from tacpipe.plugins.stage import Discovery, Files, RecordingOutput, Shared, Source, Values
 from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
@@ -39,99 +40,120 @@ class Params(StreamSelection):
 
     layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not declare; --guess prints one
 
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context in which files are read with these settings."""
+        return contextlib.nullcontext()
+
+
+class LayoutParams(Protocol):
+    """Settings of a command that reads files as a layout describes them."""
+
+    @property
+    def layout(self) -> str:
+        """The layout as JSON, or empty text for none."""
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context in which files are read with these settings."""
+
 
 @dataclass(frozen=True)
-class ContainerCommand:
-    """The functions of a stage that ingests a format of containers.
+class LayoutCommand:
+    """The functions of a stage that ingests a format of containers, or tables if ``kind`` is None.
 
     ::
 
-        COMMAND = ContainerCommand("xdf")
+        COMMAND = LayoutCommand("xdf")
 
-        @COMMAND.stage(version=1)
+        @stage(version=1, source=COMMAND.discovery)
         def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
             \"\"\"Read recordings of LSL's LabRecorder (XDF).\"\"\"
             return COMMAND.read(params, files, values)
     """
 
-    kind: layouts.Format
+    kind: layouts.Format | None
 
-    def stage(
-        self, *, version: int, preview: Callable[[Any, Path], str] | None = None
-    ) -> Callable[[Callable[P, R]], Stage[P, R]]:
-        """Declare the decorated function the stage of this format; ``preview`` replaces `preview`."""
-        return stage(
-            version=version,
-            discover=self.discover,
-            preview=preview or self.preview,
-            guess=self.guess,
-            why_unread=self.why_unread,
-        )
+    @property
+    def discovery(self) -> Discovery:
+        """How a stage of this format finds recordings."""
+        return Discovery(self.discover, self.why_unread, self.preview, self.guess)
 
-    def parsed(self, params: Params) -> layouts.Layout:
+    def parsed(self, params: LayoutParams) -> layouts.Layout:
         """Return the parsed layout, or an empty one if none was given."""
         return layouts.layout_from_tables(json.loads(params.layout or "{}"), "The layout", self.kind)
 
-    def discover(self, params: Params, source: Path) -> dict[str, Source]:
-        """Return the files and labels of each recording at or below ``source``."""
-        layout = self.parsed(params)
-        return discover_sources(layout, source, self._find_recordings(layout, source), self.kind)
+    def discover(self, params: LayoutParams, source: Path) -> dict[str, Source]:
+        """Return the files, labels and episode of each recording at or below ``source``."""
+        from tacpipe.formats.table import labels
 
-    def preview(self, params: Params, source: Path) -> str:
-        """Return a description of what would be read."""
         layout = self.parsed(params)
-        return preview_text(layout, source, self._find_recordings(layout, source), self.kind)
+        recordings = self._find_recordings(layout, source)
+        labelled = labels.find_labels(layout, source if source.is_dir() else source.parent, recordings)
+        shares = _ContainerShares(layout, self.kind)
+        sources_by_name = {}
+        for recording in recordings:
+            files, container_values = shares.files_and_values(recording)
+            optional_values = {EPISODE: recording.episode, CONTAINER_VALUES: container_values or None}
+            stated_values = {key: value for key, value in optional_values.items() if value is not None}
+            sources_by_name[recording.name] = Source(files, {LABELS: labelled[recording.name], **stated_values})
+        return sources_by_name
+
+    def preview(self, params: LayoutParams, source: Path) -> str:
+        """Return a description of what would be read from a source, and what would not."""
+        from tacpipe.formats.table import preview
+
+        layout = self.parsed(params)
+        recordings = self._find_recordings(layout, source)
+        paths = [path for recording in recordings for path in member_files(recording.files).values()]
+        left_out = describe_unread(source, paths, self.why_unread(params, source))
+        with params.reading():
+            return "\n".join([preview.describe_sources(layout, source, recordings, self.kind), *left_out])
 
     def guess(self, source: Path) -> str:
-        """Return the text of a layout with everything that the first file declares."""
-        from tacpipe.formats.table.preview import declared_layout
+        """Return the text of a layout with everything that the first file declares, or that is guessed for tables."""
+        from tacpipe.formats.table import guess, preview
 
-        return declared_layout(self.kind, source)
+        return guess.guess_layout(source) if self.kind is None else preview.declared_layout(self.kind, source)
 
-    def why_unread(self, params: Params, source: Path) -> Callable[[str], str]:
-        """Return a function from a file's path below ``source`` to the reason why it is not read."""
-        return why_unread(self.parsed(params), source, self.kind)
+    def why_unread(self, params: LayoutParams, source: Path) -> Callable[[str], str]:
+        """Return a function from a file's path below ``source`` to the reason why the layout does not read it.
 
-    def read(self, params: Params, files: Files, values: Values) -> RecordingOutput:
-        """Return one recording."""
-        return read_recording(self.parsed(params), self.kind, files, values)
+        The reason is "" for label files and for files in a container.
+        """
+        layout = self.parsed(params)
+        formats = {str(stream.format) for stream in layout.streams if stream.contained} or {self.kind} - {None}
+        folders = [path for name in formats for path in find_containers(str(name), source) if path.is_dir()]
+
+        def explain(path: str) -> str:
+            if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
+                return ""
+            if any((source / path).is_relative_to(folder) for folder in folders):
+                return ""
+            return layouts.why_unreadable(path, "no `files` of the layout matches" if layout.streams else "", self.kind)
+
+        return explain
+
+    def read(self, params: LayoutParams, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
+        """Return one recording of ``files`` from `discover`; without a layout, everything in the container.
+
+        With ``shared``, a table of several recordings is split only once.
+        """
+        from tacpipe.formats.table import recordings
+
+        layout, paths = self.parsed(params), container_paths(files)
+        with params.reading():
+            if layout.streams:
+                output = recordings.read_streams(layout.streams, paths, values.get(EPISODE), shared)
+            else:
+                output = recordings.read_container(str(self.kind), paths[recordings.CONTAINER], values.get(EPISODE))
+        return replace(output, attributes={**output.attributes, **values[LABELS]})
 
     def _find_recordings(self, layout: layouts.Layout, source: Path) -> list[recordings.RecordingFiles]:
         """Return the recordings of a source: its containers, or those that the patterns of the layout match."""
         from tacpipe.formats.table import recordings
 
-        if layout.found_by_format:
+        if self.kind is not None and layout.found_by_format:
             return recordings.find_contained(layout, self.kind, source)
         return recordings.find_recordings(layout, source)
-
-
-def discover_sources(
-    layout: layouts.Layout,
-    source: Path,
-    recordings: Sequence[recordings.RecordingFiles],
-    kind: layouts.Format | None = None,
-) -> dict[str, Source]:
-    """Return the files, labels and episode of each recording, as a stage's ``discover`` does.
-
-    ``kind`` is the container format if the layout has no streams.
-    """
-    from tacpipe.formats.table import labels
-
-    labelled = labels.find_labels(layout, source if source.is_dir() else source.parent, recordings)
-    shares = _ContainerShares(layout, kind)
-    sources_by_name = {}
-    for recording in recordings:
-        files, extra_values = shares.files_and_values(recording)
-        recording_value = {} if recording.episode is None else {EPISODE: recording.episode}
-        sources_by_name[recording.name] = Source(
-            files,
-            {
-                LABELS: labelled[recording.name],
-                **recording_value,
-                **({CONTAINER_VALUES: extra_values} if extra_values else {}),
-            },
-        )
-    return sources_by_name
 
 
 class _ContainerShares:
@@ -139,7 +161,7 @@ class _ContainerShares:
 
     def __init__(self, layout: layouts.Layout, kind: layouts.Format | None) -> None:
         self._layout, self._kind = layout, kind
-        self._opened: dict[Path, object] = {}
+        self._opened: dict[Path, Container] = {}
 
     def files_and_values(self, recording: recordings.RecordingFiles) -> tuple[dict[str, Path], Values]:
         """Return the files of a recording by name, and the values it depends on in containers shared by recordings."""
@@ -170,64 +192,11 @@ class _ContainerShares:
             with failures.naming_source([path]):
                 if path not in self._opened:
                     self._opened[path] = open_container(str(kind), path)
-                container = self._opened[path]
-                return container.share(requested, episode) if isinstance(container, Sharing) else None
+                return self._opened[path].share(requested, episode)
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
             return None  # reading reports the error for this recording only
-
-
-def preview_text(
-    layout: layouts.Layout,
-    source: Path,
-    listed_sources: Sequence[recordings.RecordingFiles],
-    kind: layouts.Format | None = None,
-) -> str:
-    """Return a description of what would be read from a source, and what would not."""
-    from tacpipe.formats.table import preview
-
-    paths = [path for recording in listed_sources for path in member_files(recording.files).values()]
-    left_out = describe_unread(source, paths, why_unread(layout, source, kind))
-    return "\n".join([preview.describe_sources(layout, source, listed_sources, kind), *left_out])
-
-
-def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None = None) -> Callable[[str], str]:
-    """Return a function from a file's path below ``source`` to the reason why the layout does not read it.
-
-    The reason is "" for label files and for files in a container.
-    """
-    formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(KINDS)
-    folders = [path for name in formats for path in find_containers(name, source) if path.is_dir()]
-
-    def explain(path: str) -> str:
-        if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
-            return ""
-        if any((source / path).is_relative_to(folder) for folder in folders):
-            return ""
-        return layouts.why_unreadable(path, "no `files` of the layout matches" if layout.streams else "", kind)
-
-    return explain
-
-
-def read_recording(
-    layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values, shared: Shared | None = None
-) -> RecordingOutput:
-    """Return one recording of ``files`` from `discover_sources`; without a layout, everything in the container.
-
-    With ``shared``, a table of several recordings is split only once.
-    """
-    from tacpipe.formats.table import recordings
-    from tacpipe.formats.table.recordings import CONTAINER
-
-    paths = container_paths(files)
-    if layout.streams:
-        recorded_streams = recordings.read_streams(layout.streams, paths, values.get(EPISODE), shared)
-    else:
-        recorded_streams = recordings.read_container(str(kind), paths[CONTAINER], values.get(EPISODE))
-    return RecordingOutput(
-        recorded_streams.streams, {**recorded_streams.attributes, **values[LABELS]}, recorded_streams.notes, rows={}
-    )
 
 
 def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:

@@ -20,6 +20,7 @@ import pyarrow as pa
 
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.faults import explaining
 from tacpipe.formats.table import binary, column_names, label_table, stamps, text
 from tacpipe.formats.table.binary import STREAM_COLUMNS, ArrayMember
 from tacpipe.formats.table.columns import MAX_EXACT, TYPES
@@ -49,6 +50,12 @@ class Dialect:
     rows: tuple[tuple[str, ...], ...] = field(repr=False)  # cells below the header
     missing: tuple[str, ...] = ()  # values of MISSING that occur
     units: tuple[str, ...] = ()  # units of the columns, if the row below the header contains them
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The entries of a layout that describe the text, except its encoding and missing values."""
+        names = ("separator", "decimal", "comment", "skip_lines", "header")
+        return {name: getattr(self, name) for name in names}
 
     def number(self, cell: str) -> float | None:
         """Return the number in a cell, an int if it is written as one, or None if it is not a number.
@@ -199,12 +206,9 @@ def read_sample(path: Path) -> FileSample:
     kind = EXTENSIONS[extension(path)]
     if kind == "csv":
         encoding = detect_encoding(path)
-        try:
+        advice = ". Copy it again from its source, or leave it out."
+        with explaining(csv.Error, f"{path} is not a table: ", advice):
             text = detect_dialect(first_lines(path, encoding))
-        except csv.Error as error:
-            raise TacpipeError(
-                f"{path} is not a table: {error}. Copy it again from its source, or leave it out."
-            ) from error
         column_names.expect_short(text.names, path)
         columns = list(zip(*text.rows, strict=True)) or [()] * len(text.names)
         values = {
@@ -254,9 +258,8 @@ def _time_axis(arrays: Mapping[str, ArrayMember]) -> int:
     shape = next(iter(arrays.values())).shape if len(arrays) == 1 else ()
     if len(shape) < 2:
         return 0
-    longest = shape.index(max(shape))
     is_table = max(shape) > 0 and math.prod(shape) // max(shape) <= STREAM_COLUMNS
-    return longest if is_table and shape[0] < 100 and shape[longest] >= 4 * shape[0] else 0
+    return column_names.longer_axis(shape) if is_table else 0
 
 
 def belongs_to(column: str, array: str) -> bool:
@@ -418,9 +421,9 @@ def time_entry(sample: FileSample, column: str | None, file: str = "") -> str:
     suffix = re.search(r"(?:^|[_ ])(ms|us|ns|s|sec|seconds)$", column_names.without_unit(column), re.IGNORECASE)
     unit_text = sample.stated_unit(column) or schema.unit_from_text(suffix[1] if suffix else "")
     stated_s = usual * 10.0 ** (stamps.DIGITS.get(unit_text, 9) - 9)
-    for limit, unit in ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns")):
-        if 1e8 <= usual < limit and (stated_s >= 1e8 or unit_text not in stamps.DIGITS):
-            return f'{{ {source}, unit = "{unit}" }}'
+    unix_unit = stamps.unit_of_unix_time(usual)
+    if unix_unit is not None and (stated_s >= stamps.MIN_UNIX_S or unit_text not in stamps.DIGITS):
+        return f'{{ {source}, unit = "{unix_unit}" }}'
     steps = np.diff([value for value in values if isinstance(value, float)])
     if not unit_text and len(steps) and 0 < float(np.median(steps)) < 0.5:
         unit_text = "s"  # in ms, steps this small would mean thousands of rows per second

@@ -9,10 +9,10 @@ from __future__ import annotations
 import itertools
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
 from tacpipe.formats import container, image_files
@@ -42,6 +42,9 @@ VOCABULARY = (  # help for replacing a "?"
     "unit: as count, m, mm, 1 (of a quaternion), rad, N, kPa, V; of time s, ms, us, ns",
     '{taxel} and {axis} in match state where a tactile column lies; component = "x" which part of a vector it is',
 )
+
+
+Sampled = TypeVar("Sampled")  # the beginning of a file
 
 
 @dataclass(frozen=True)
@@ -105,13 +108,8 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
     damaged: dict[str, str] = {}
     used: set[str] = set()
     for paths in itertools.chain.from_iterable(map(_group_by_file_name, by_template.values())):
-        try:
-            with failures.naming_source([folder / paths[0]]):
-                sample = file_sample.read_sample(folder / paths[0])
-        except MissingModuleError:
-            raise
-        except TacpipeError as error:
-            damaged |= {path.as_posix(): str(error).rstrip(".") for path in paths}
+        sample = _read_first(file_sample.read_sample, folder, paths, damaged)
+        if sample is None:
             continue
         if sample.text is not None and not (sample.text.header or sample.text.rows):
             damaged |= {path.as_posix(): "it has no row" for path in paths}
@@ -129,6 +127,23 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], 
         else:
             streams += _group_by_length(group)
     return streams, labels, damaged
+
+
+def _read_first(
+    read: Callable[[Path], Sampled], folder: Path, paths: Sequence[Path], damaged: dict[str, str]
+) -> Sampled | None:
+    """Return what ``read`` returns for the first file of a stream.
+
+    If it is damaged, returns None, and adds the reason for each of the ``paths`` to ``damaged``.
+    """
+    try:
+        with failures.naming_source([folder / paths[0]]):
+            return read(folder / paths[0])
+    except MissingModuleError:
+        raise
+    except TacpipeError as error:
+        damaged |= {path.as_posix(): str(error).rstrip(".") for path in paths}
+        return None
 
 
 def _with_columns_of(sample: FileSample, paths: Sequence[Path]) -> FileSample:
@@ -156,14 +171,10 @@ def _camera_groups(
     groups = []
     for (_, are_folders), paths in by_template.items():
         for same_stream in _group_by_file_name(paths):
-            try:
-                with failures.naming_source([folder / same_stream[0]]):
-                    entries, count = (_image_entries if are_folders else _video_entries)(folder / same_stream[0])
-            except MissingModuleError:
-                raise
-            except TacpipeError as error:
-                damaged |= {path.as_posix(): str(error).rstrip(".") for path in same_stream}
+            described = _read_first(_image_entries if are_folders else _video_entries, folder, same_stream, damaged)
+            if described is None:
                 continue
+            entries, count = described
             sample = FileSample((), {}, frames=count)
             members = tuple(path for path in images if path.parent in same_stream) if are_folders else ()
             name = _stream_name(same_stream, used)

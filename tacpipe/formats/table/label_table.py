@@ -14,8 +14,9 @@ from typing import Any
 from tacpipe.datasets import intervals
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats import container
+from tacpipe.formats.faults import explaining
 from tacpipe.formats.table.layout import TREES
-from tacpipe.io import config_text, regular
+from tacpipe.io import config_text, parquet, regular
 from tacpipe.io.config_text import plain_value
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
@@ -28,7 +29,7 @@ def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
     Raises `TacpipeError` if a line has another number of cells than the header.
     """
-    text = read_text(path)
+    text = _read_text(path)
     separator = ";" if ";" in text.partition("\n")[0] else ","
     separator = "\t" if path.suffix.lower() == ".tsv" else separator
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
@@ -44,7 +45,7 @@ def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         yield reader.line_num, [cell.strip() for cell in cells]
 
 
-def read_text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     """Return the text of a label file. Raises `TacpipeError` if it is too large or not UTF-8."""
     with regular.failing(path):
         content = regular.content(path, MAX_LABEL_BYTES)
@@ -77,6 +78,7 @@ class LabelTable:
     path: Path
     key: str
     rows: tuple[LabelRow, ...]
+    columns: tuple[str, ...] = ()  # labels of each row of a table of cells; those of empty cells are not in the rows
 
     def by_recording(
         self, attributes_by_name: Mapping[str, Mapping[str, Attribute]]
@@ -121,25 +123,36 @@ def read_label_table(
 ) -> LabelTable:
     """Return the label table in a file. ``key`` is the column with the recordings' names; if empty, it is inferred.
 
-    The inferred column is the one whose values are all in ``attributes_by_name``, else the first named recording,
-    trial, episode …. Numbers, true and false keep their types. Raises `UsageError` for another kind of file and if no
-    column can be the key, and `TacpipeError` with file and row for an invalid label.
+    Raises `UsageError` for another kind of file and for a file without rows, and the errors of `parse_label_table`.
     """
-    suffix = path.suffix.lower()
-    if suffix not in EXTENSIONS:
+    if path.suffix.lower() not in EXTENSIONS:
         raise UsageError(f"{path} is not a table of labels by its name; give one of {', '.join(EXTENSIONS)}.")
     if not path.is_file():
         raise UsageError(f"There is no file {path}.")
-    is_text = suffix in (".csv", ".tsv")
-    read_other = _read_parquet if suffix == ".parquet" else _read_tree
-    rows = list(_read_text_rows(path) if is_text else read_other(path))
-    if not rows:
+    table = parse_label_table(path, key, attributes_by_name)
+    if not table.rows:
         raise UsageError(f"{path} holds no row; nothing would change.")
+    return table
+
+
+def parse_label_table(
+    path: Path, key: str = "", attributes_by_name: Mapping[str, Mapping[str, Attribute]] | None = None
+) -> LabelTable:
+    """Return the label table in a file; text that is neither Parquet, YAML nor JSON is a table of cells.
+
+    The inferred column is the one whose values are all in ``attributes_by_name``, else the first named recording,
+    trial, episode …. Numbers, true and false keep their types. Raises `UsageError` if no column can be the key, and
+    `TacpipeError` with file and row for an invalid label.
+    """
+    readers = {".parquet": _read_parquet, **dict.fromkeys(TREES, _read_tree)}
+    is_text = path.suffix.lower() not in readers
+    rows = list(readers.get(path.suffix.lower(), read_text_rows)(path))
     columns = list(dict.fromkeys(name for _, row in rows for name in row))
-    if key and key not in columns:
+    if key and rows and key not in columns:
         raise UsageError(f"{path} has no column {plain(key)}; it has {listed(columns)}.")
-    key_column = key or _find_key_column(path, columns, rows, set(attributes_by_name or ()))
-    return LabelTable(path, key_column, tuple(_label_row(path, place, key_column, row, is_text) for place, row in rows))
+    key_column = key or (_find_key_column(path, columns, rows, set(attributes_by_name or ())) if rows else NAME)
+    label_rows = tuple(_label_row(path, place, key_column, row, is_text) for place, row in rows)
+    return LabelTable(path, key_column, label_rows, tuple(columns) if is_text else ())
 
 
 Cell = Attribute | datetime.date  # a value of a table; others are refused
@@ -170,10 +183,12 @@ def _label_row(path: Path, place: str, key: str, row: Mapping[str, Cell], is_tex
     values = {label: value for label, value in row.items() if label != key}
     if is_text:
         values = {label: plain_value(str(value)) for label, value in values.items() if value}
-    return LabelRow(place, name, {label: _label_value(path, place, label, value) for label, value in values.items()})
+    return LabelRow(
+        place, name, {label: label_value(f"{path}, {place}", label, value) for label, value in values.items()}
+    )
 
 
-def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
+def label_value(place: str, label: str, value: Any) -> Attribute:
     """Return a label's value; dates become text. Raises `TacpipeError` if it is not plain."""
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
@@ -181,11 +196,11 @@ def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
     if is_finite and (value is None or isinstance(value, str | int | float | bool)):
         return value
     raise TacpipeError(
-        f"{path}, {place}: {plain(label)} is {excerpt(value)}; a label is text, a finite number, or true or false."
+        f"{place}: {plain(label)} is {excerpt(value)}; a label is text, a finite number, or true or false."
     )
 
 
-def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
+def read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     """Yield the place of each row of a text table, and its cells by the names of the header."""
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
@@ -198,8 +213,6 @@ def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
 
     Raises `TacpipeError` if the file is damaged.
     """
-    from tacpipe.io import parquet, regular
-
     with regular.failing(path):
         content = regular.content(path, MAX_LABEL_BYTES)
     try:
@@ -210,17 +223,20 @@ def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
         yield f"row {number}", {name: value for name, value in row.items() if value is not None}
 
 
+def parse_tree(path: Path) -> Any:
+    """Return the value in a JSON or YAML file of labels. Raises `TacpipeError` if it cannot be read."""
+    text = _read_text(path)
+    with explaining((ValueError, RecursionError), f"{path} cannot be read: ", ". Correct it."):
+        return container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_labels(text)
+
+
 def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Cell]]]:
     """Yield the position and the labels of each entry of a JSON or YAML file.
 
     The file contains a mapping of names to labels, or a list of labels. Raises `TacpipeError` if it contains neither, or if
     an entry is not a mapping.
     """
-    text = read_text(path)
-    try:
-        tree = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_labels(text)
-    except (ValueError, RecursionError) as error:
-        raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
+    tree = parse_tree(path)
     entries: list[tuple[str, Any]] = []
     if isinstance(tree, dict):
         for name, labels in tree.items():

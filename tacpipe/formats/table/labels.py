@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import datetime
-import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import container
 from tacpipe.formats.table import label_table, pattern
-from tacpipe.formats.table.label_table import read_rows, read_text
-from tacpipe.formats.table.layout import TREES, LabelSource, Layout
+from tacpipe.formats.table.layout import LabelSource, Layout
 from tacpipe.formats.table.recordings import RecordingFiles, joined_values
-from tacpipe.io import config_text
 from tacpipe.io.config_text import plain_value
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
@@ -30,7 +24,13 @@ def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles])
     two rows of one recording, a missing column, and a value that is not plain.
     """
     labels_by_name: dict[str, dict[str, Attribute]] = {
-        source.name: {**layout.attributes, **{name: plain_value(value) for name, value in _placeholder_values(source)}}
+        source.name: {
+            **layout.attributes,
+            # the name of the recording itself is no label
+            **{
+                key: plain_value(text) for key, text in source.values.items() if (key, text) != (RECORDING, source.name)
+            },
+        }
         for source in sources
     }
     for labels in layout.labels:
@@ -47,45 +47,18 @@ def find_labels(layout: Layout, folder: Path, sources: Sequence[RecordingFiles])
     return labels_by_name
 
 
-def _placeholder_values(source: RecordingFiles) -> Iterator[tuple[str, str]]:
-    """Yield the placeholders of a recording's files with their text; the recording's name itself is not a label."""
-    for name, value in source.values.items():
-        if (name, value) != (RECORDING, source.name):
-            yield name, value
-
-
-def _read_single_row(path: Path) -> dict[str, Attribute]:
-    """Return the single row of a table that describes one recording. Raises `TacpipeError` for another number of rows."""
-    rows = list(read_rows(path))
-    if len(rows) != 2:
-        raise TacpipeError(
-            f"{path} has {max(len(rows) - 1, 0)} rows below its header; the labels of one recording are one row."
-        )
-    return {name: plain_value(cell) for name, cell in zip(rows[0][1], rows[1][1], strict=True)}
-
-
 def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attribute]]:
-    """Return the labels in a label table by the value of its key column, or by name for a YAML or JSON mapping.
+    """Return the labels in a label table by the name of their recording; an empty cell is the label None.
 
-    Raises `TacpipeError` for a missing key column and for repeated keys.
+    Raises `TacpipeError` for a missing key column and for repeated names.
     """
-    if path.suffix.lower() in TREES:
-        label_rows = label_table.read_label_table(path, labels.key)
-        repeated = [name for name, count in Counter(row.recording for row in label_rows.rows).items() if count > 1]
-        if repeated:
-            raise TacpipeError(f"{path}: {plain(repeated[0])} has an entry already. Keep one of them.")
-        return {row.recording: dict(row.labels) for row in label_rows.rows}
-    numbered = read_rows(path)
-    header = next(numbered, (0, []))[1]
-    if labels.key not in header:
-        raise TacpipeError(f"{path} has no column {plain(labels.key)}; it has {listed(header, 6)}.")
-    key_index = header.index(labels.key)
+    table = label_table.parse_label_table(path, labels.key)
+    empty_cells: dict[str, Attribute] = {name: None for name in table.columns if name != table.key}
     rows: dict[str, dict[str, Attribute]] = {}
-    for line, cells in numbered:
-        key = cells[key_index]
-        if key in rows:
-            raise TacpipeError(f"{path}, line {line}: {plain(key)} has a row already. Keep one of them.")
-        rows[key] = {name: plain_value(cell) for name, cell in zip(header, cells, strict=True) if name != labels.key}
+    for row in table.rows:
+        if row.recording in rows:
+            raise TacpipeError(f"{path}, {row.place}: {plain(row.recording)} has a row already. Keep one of them.")
+        rows[row.recording] = {**empty_cells, **row.labels}
     return rows
 
 
@@ -123,35 +96,17 @@ def _read_label_file(folder: Path, labels: LabelSource, source: RecordingFiles) 
     """Return the labels in the file of one recording. Raises `TacpipeError` if they cannot be read."""
     path = folder / pattern.fill_pattern(labels.file, {**source.values, "recording": source.episode or source.name})
     if path.suffix.lower() in (".csv", ".tsv"):
-        return _read_single_row(path)
-    text = read_text(path)
-    try:
-        values = container.json_value(text, path) if path.suffix.lower() == ".json" else config_text.load_labels(text)
-    except (ValueError, RecursionError) as error:
-        raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
+        rows = list(label_table.read_text_rows(path))
+        if len(rows) != 1:
+            raise TacpipeError(
+                f"{path} has {len(rows)} rows below its header; the labels of one recording are one row."
+            )
+        return {name: plain_value(str(cell)) for name, cell in rows[0][1].items()}
+    values = label_table.parse_tree(path)
     if not isinstance(values, dict):
         raise TacpipeError(f"{path} holds {excerpt(values)}; labels are NAME: VALUE, one a line.")
-    return {plain(str(name)): _label_value(value, name, path) for name, value in _flatten(values).items()}
-
-
-def _flatten(values: Mapping[Any, Any], prefix: str = "") -> dict[str, Attribute | datetime.date]:
-    """Return nested mappings as one mapping with dotted names."""
-    flat: dict[str, Attribute | datetime.date] = {}
-    for name, value in values.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
-
-
-def _label_value(value: Any, name: Any, path: Path) -> Attribute:
-    """Return a label's value; dates become text. Raises `TacpipeError` if it is not plain."""
-    if isinstance(value, datetime.date | datetime.datetime):
-        return value.isoformat()
-    is_finite = not isinstance(value, float) or math.isfinite(value)
-    if is_finite and (value is None or isinstance(value, str | int | float | bool)):
-        return value
-    raise TacpipeError(
-        f"{path}: {plain(str(name))} is {excerpt(value)}; a label is text, a finite number, or true or false."
-    )
+    flat = container.flatten(values).items()
+    return {plain(str(name)): label_table.label_value(str(path), str(name), value) for name, value in flat}
 
 
 def _select_columns(values: dict[str, Attribute], labels: LabelSource, recording: str) -> dict[str, Attribute]:

@@ -10,7 +10,7 @@ import json
 import tomllib
 import zoneinfo
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,6 +74,8 @@ TREES = (".json", ".yaml", ".yml")  # files with labels by name
 TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
 STAMPS = ".stamps"  # suffix of a stream's name for its file of timestamps
 GZIP = ".gz"
+ROW = "number of the row"  # added column of a table of which each row is a recording
+ONE_ROW = {"rate_hz": 1.0}  # time of a recording of one row without a time: it is at 0
 FILE = "file"  # placeholder for a container's name if containers are found by format
 UNKNOWN = "?"  # marks an entry of a guessed layout that a person must fill in
 MAX_NAMED = 4  # maximum number of unknown entries named in an error
@@ -136,7 +138,9 @@ class StreamLayout:
     @property
     def camera(self) -> str:
         """``video`` or ``images`` for a stream of frames, from its format or file suffix; otherwise ""."""
-        return camera_format(self.format, self.files)
+        if self.format is None:
+            return "video" if extension(Path(self.files)) in DEMUXERS else ""
+        return self.format if self.format in CAMERA else ""
 
     @property
     def contained(self) -> bool:
@@ -206,6 +210,15 @@ class Vocabulary:
 
 
 @dataclass(frozen=True)
+class RecordingsTable:
+    """The table ``[recordings]``: how recordings are named, and whether each row of a stream is one."""
+
+    name: str = ""
+    per_row: str = ""
+    labels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Layout:
     """The contents of a layout file."""
 
@@ -213,6 +226,29 @@ class Layout:
     name: str = ""  # pattern of a recording's name; empty for all placeholders joined by dashes
     labels: tuple[LabelSource, ...] = ()
     attributes: Mapping[str, str | int | float | bool] = field(default_factory=dict)
+    per_row: str = ""  # stream of which each row is a recording; empty for recordings that are files
+    row_labels: tuple[str, ...] = ()  # columns of that stream that are labels of the recordings
+
+    @property
+    def row_streams(self) -> tuple[StreamLayout, ...]:
+        """The streams whose files the cells of a row name, such as the image of each row."""
+        table = next((stream for stream in self.streams if stream.name == self.per_row), None)
+        in_table = set() if table is None else set(pattern.placeholders(table.files))
+        return tuple(
+            stream for stream in self.streams if table and not set(pattern.placeholders(stream.files)) <= in_table
+        )
+
+    @property
+    def row_columns(self) -> tuple[str, ...]:
+        """The columns of the table of recordings that are labels, or placeholders in the files of other streams."""
+        table_placeholders = {
+            name
+            for stream in self.streams
+            if stream.name == self.per_row
+            for name in pattern.placeholders(stream.files)
+        }
+        named = [name for stream in self.row_streams for name in pattern.placeholders(stream.files)]
+        return tuple(dict.fromkeys([*self.row_labels, *(name for name in named if name not in table_placeholders)]))
 
     @property
     def found_by_format(self) -> bool:
@@ -224,7 +260,8 @@ class Layout:
         """The placeholders in the patterns of all required streams, in the order of the first."""
         if self.found_by_format:
             return ()
-        required = [stream for stream in self.streams if not stream.optional] or list(self.streams)
+        found_by_path = [stream for stream in self.streams if stream not in self.row_streams]
+        required = [stream for stream in found_by_path if not stream.optional] or found_by_path
         shared = set.intersection(*(set(pattern.placeholders(stream.files)) for stream in required))
         return tuple(name for name in pattern.placeholders(required[0].files) if name in shared)
 
@@ -253,19 +290,23 @@ def layout_from_tables(tables: Values, place: str = "The layout", container: For
     if not streams and container is None:
         raise UsageError(f"{place} has no stream. Add a table such as [streams.skin] with files, time and columns.")
     recordings = _expect_table(tables.get("recordings", {}), place, "recordings")
-    for key in recordings:
-        if key != "name":
-            raise fields.unknown(key, {"name": str}, f"{place}, [recordings]", "entry")
-    name = fields.check(recordings.get("name", ""), str, "name", f"{place}, [recordings]")
+    given: RecordingsTable = fields.build_dataclass(RecordingsTable, recordings, f"{place}, [recordings]", "entry")
+    if given.labels and not given.per_row:
+        raise UsageError(f"{place}, [recordings]: labels are columns of the stream that per_row names. Add per_row.")
+    name = given.name
     labels = tables.get("labels", [])
     if not isinstance(labels, list):
         raise UsageError(f"{place}: labels is a list of tables. Write [[labels]].")
     layout = Layout(
-        tuple(_parse_stream(stream, value, place, container) for stream, value in streams.items()),
+        tuple(_parse_stream(stream, value, place, container, given) for stream, value in streams.items()),
         name,
         tuple(_parse_labels(value, f"{place}, [[labels]] {number}") for number, value in enumerate(labels, 1)),
         _parse_attributes(tables.get("attributes", {}), place),
+        given.per_row,
+        given.labels,
     )
+    if layout.per_row:
+        layout = _with_rows(layout, f"{place}, [recordings]")
     words = _expect_table(tables.get("vocabulary", {}), place, "vocabulary")
     _expect_known_words(layout, fields.build_dataclass(Vocabulary, words, f"{place}, [vocabulary]", "entry"), place)
     with_files = [value.name for value in layout.streams if value.files]
@@ -276,6 +317,27 @@ def layout_from_tables(tables: Values, place: str = "The layout", container: For
     available = [*layout.placeholders, "recording", *((FILE,) if layout.found_by_format else ())]
     pattern.fill_pattern(name, dict.fromkeys(available, "x"))
     return layout
+
+
+def _with_rows(layout: Layout, place: str) -> Layout:
+    """Return the layout with rules that skip the columns of the table of recordings that describe these.
+
+    Raises `UsageError` unless ``per_row`` names a table with one row per time.
+    """
+    table = next((stream for stream in layout.streams if stream.name == layout.per_row), None)
+    if table is None:
+        raise UsageError(
+            f"{place}: per_row is {excerpt(layout.per_row)}; it must be one of the streams "
+            f"{', '.join(stream.name for stream in layout.streams)}."
+        )
+    if table.camera or table.array or table.contained or table.long or table.recording != ROW:
+        raise UsageError(f"{place}: per_row is for a table with one row per time, and {table.name} is none.")
+    if table.time.file or any(getattr(table.time, name) for name in REPAIRS if name != "offset_s"):
+        raise UsageError(f"{place}: each row of {table.name} is a recording, so its time is a column, or left out.")
+    exact = {rule.match for rule in table.columns}
+    skipped = tuple(ColumnRule(name, skip=True) for name in layout.row_columns if name not in exact)
+    changed = replace(table, columns=(*skipped, *table.columns))
+    return replace(layout, streams=tuple(changed if stream is table else stream for stream in layout.streams))
 
 
 def _expect_known_words(layout: Layout, local: Vocabulary, place: str) -> None:
@@ -316,7 +378,9 @@ def _unknown_entries(value: Any, place: str) -> Iterator[str]:
                 yield from _unknown_entries(element, f"{place}, {plain(key)}")
 
 
-def _parse_stream(name: str, value: Any, place: str, container: Format | None) -> StreamLayout:
+def _parse_stream(
+    name: str, value: Any, place: str, container: Format | None, recordings: RecordingsTable
+) -> StreamLayout:
     """Return the layout of a stream from its table. Raises `UsageError` for a missing, unknown or contradictory entry."""
     stream_place = f"{place}, [streams.{plain(name)}]"
     values = dict(_expect_table(value, stream_place, ""))
@@ -326,24 +390,24 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
         )
     if container is not None:
         values.setdefault("format", container)
-    _expect_required(values, stream_place, container)
-    if "time" in values:
-        values["time"] = _parse_time(values["time"], stream_place)
-    columns = values.get("columns", [])
-    if not isinstance(columns, list):
-        raise UsageError(f"{stream_place}: columns is {excerpt(columns)}; it must be a list of tables.")
-    values["columns"] = tuple(
-        _parse_column(column, f"{stream_place}, columns {number}") for number, column in enumerate(columns, 1)
-    )
-    if "long" in values:
-        values["long"] = fields.build_dataclass(
-            LongColumns, _expect_table(values["long"], stream_place, "long"), f"{stream_place}, long", "entry"
-        )
+    if recordings.per_row:
+        values = _row_defaults(values, is_table=name == recordings.per_row)
+    if isinstance(values.get("columns"), list):
+        numbered = enumerate(values["columns"], 1)
+        values["columns"] = [_with_pairs(column, f"{stream_place}, columns {number}") for number, column in numbered]
     if isinstance(values.get("header"), list):
         values["names"], values["header"] = values["header"], False
-    if "missing" in values and isinstance(values["missing"], list):
-        values["missing"] = tuple(values["missing"])
-    stream: StreamLayout = fields.build_dataclass(StreamLayout, {"name": name, **values}, stream_place, "entry")
+    stream: StreamLayout = fields.build_dataclass(
+        StreamLayout, {"name": name, **values}, stream_place, "entry", "entry"
+    )
+    if stream.contained:
+        _expect_contained(stream, stream_place, container)
+    else:
+        _expect_table_entries(stream, stream_place, has_time="time" in values)
+    if "time" in values:
+        _expect_time(stream.time, f"{stream_place}, time")
+    for number, column in enumerate(stream.columns, 1):
+        _expect_column(column, f"{stream_place}, columns {number}")
     if len(stream.separator) > 1:
         raise UsageError(f"{stream_place}: separator is {excerpt(stream.separator)}; it must be one character.")
     if stream.separator and stream.separator == stream.decimal:
@@ -358,6 +422,20 @@ def _parse_stream(name: str, value: Any, place: str, container: Format | None) -
     return stream
 
 
+def _row_defaults(values: Values, *, is_table: bool) -> dict[str, Any]:
+    """Return the entries of a stream whose recordings are rows, with those that are understood."""
+    is_video = StreamLayout("", str(values.get("files", "")), format=values.get("format")).camera == "video"
+    defaults: dict[str, Any] = {} if is_video else {"time": ONE_ROW}
+    return {**defaults, **({"recording": ROW} if is_table else {}), **values}
+
+
+def _with_pairs(column: Any, place: str) -> Any:
+    """Return a column of a layout with the table ``about`` as sorted pairs. Raises `UsageError` if it is no table."""
+    if not isinstance(column, dict) or "about" not in column:
+        return column
+    return {**column, "about": sorted(_expect_table(column["about"], place, "about").items())}
+
+
 def _expect_encoding(stream: StreamLayout, place: str) -> None:
     """Raise `UsageError` for an encoding unknown to Python."""
     try:
@@ -368,90 +446,53 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
         ) from None
 
 
-def _expect_required(values: Values, place: str, container: Format | None) -> None:
-    """Raise `UsageError` if a required entry of a stream is missing, or an entry is not allowed for the stream's format.
-
-    Containers require fewer entries, because they declare more.
-    """
-    if values.get("format") in KINDS:
-        if not values.get("source"):
-            raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
-        if values.get("recording"):
-            raise UsageError(f"{place}: recording is for tables; a container names the recordings in it itself.")
-        if isinstance(values.get("time"), dict) and values["time"].get("file"):
-            raise UsageError(f"{place}: time.file is for tables; a container holds its stamps. Name their column.")
-        if "files" not in values and container is None:
-            raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{values["format"]}".')
-        return
-    camera = camera_format(values.get("format"), values.get("files"))
-    if values.get("array"):
-        _expect_images(values, place)
-    if values.get("source"):
-        raise UsageError(f"{place}: source is for containers ({', '.join(KINDS)}). Set format to one of them.")
-    if "files" not in values:
-        raise UsageError(f"{place}: entry files must be given.")
-    if camera:
-        _expect_camera(values, place, camera)
-        return
-    if "time" not in values:
-        raise UsageError(
-            f'{place}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
-            "{ rate_hz = 100 }."
-        )
-    if not values.get("columns") and not values.get("array"):
-        raise UsageError(f'{place}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
+def _expect_contained(stream: StreamLayout, place: str, container: Format | None) -> None:
+    """Raise `UsageError` for a missing or unfit entry of a stream in a container."""
+    if not stream.source:
+        raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
+    if stream.recording:
+        raise UsageError(f"{place}: recording is for tables; a container names the recordings in it itself.")
+    if stream.time.file:
+        raise UsageError(f"{place}: time.file is for tables; a container holds its stamps. Name their column.")
+    if not stream.files and container is None:
+        raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{stream.format}".')
 
 
-def camera_format(kind: object, files: object) -> str:
-    """Return ``video`` or ``images`` for a stream of frames, from its format or the suffix of its files; otherwise "".
-
-    >>> camera_format(None, "{trial}/left.AVI"), camera_format("images", "{trial}/left"), camera_format(None, "a.csv")
-    ('video', 'images', '')
-    """
-    if kind is None and isinstance(files, str):
-        return "video" if extension(Path(files)) in DEMUXERS else ""
-    return str(kind) if kind in CAMERA else ""
-
-
-def _expect_images(values: Values, place: str) -> None:
-    """Raise `UsageError` for an array of images in a file that is not NPZ or NPY, or with entries of tables."""
-    files = values.get("files")
-    kind = values.get("format") or (EXTENSIONS.get(extension(Path(files))) if isinstance(files, str) else None)
-    if kind not in ("npz", "npy"):
+def _expect_table_entries(stream: StreamLayout, place: str, *, has_time: bool) -> None:
+    """Raise `UsageError` for a missing or unfit entry of a stream of tables, images or a video."""
+    if stream.array and (stream.format or EXTENSIONS.get(extension(Path(stream.files)))) not in ("npz", "npy"):
         raise UsageError(f"{place}: array is for npz and npy. Use source for HDF5 and Zarr, and format for images.")
-    table_entries = [name for name in ("columns", "recording", "long") if values.get(name)]
-    if table_entries:
-        raise UsageError(
-            f"{place}: {table_entries[0]} is for tables. A stream of images has a row per frame; remove it."
-        )
-
-
-def _expect_camera(values: Values, place: str, camera: str) -> None:
-    """Raise `UsageError` for a table entry in a stream of frames, and for images without a time."""
-    table_entries = [name for name in ("columns", "recording", "long", "header", "separator") if values.get(name)]
-    if table_entries:
-        raise UsageError(
-            f"{place}: {table_entries[0]} is for tables. A {camera} stream has a row per frame; remove it."
-        )
-    time = values.get("time")
-    if camera == "images" and time is None:
+    if stream.source:
+        raise UsageError(f"{place}: source is for containers ({', '.join(KINDS)}). Set format to one of them.")
+    if not stream.files:
+        raise UsageError(f"{place}: entry files must be given.")
+    entries: dict[str, object] = {"columns": stream.columns, "recording": stream.recording, "long": stream.long}
+    entries |= {"header": stream.names, "separator": stream.separator} if stream.camera else {}
+    table_entries = [name for name, value in entries.items() if value]
+    if (stream.camera or stream.array) and table_entries:
+        noun = f"A {stream.camera} stream" if stream.camera else "A stream of images"
+        raise UsageError(f"{place}: {table_entries[0]} is for tables. {noun} has a row per frame; remove it.")
+    if stream.camera == "images" and not has_time:
         raise UsageError(
             f'{place}: time must be given, as time = {{ column = "{IMAGE_NAME}", unit = "ns" }} (the last number in the '
             'names of the images), { file = "{trial}/stamps.csv" } or { rate_hz = 25 }.'
         )
-    column = time.get("column") if isinstance(time, dict) and not time.get("file") else None
-    if column and (camera == "video" or column != IMAGE_NAME):
-        expected = f'column = "{IMAGE_NAME}", file or rate_hz' if camera == "images" else "file or rate_hz, or no time"
-        raise UsageError(f"{place}: time.column is {excerpt(column)}; a stream of {camera} takes {expected}.")
+    column = "" if stream.time.file else stream.time.column
+    if stream.camera and column and (stream.camera == "video" or column != IMAGE_NAME):
+        is_images = stream.camera == "images"
+        expected = f'column = "{IMAGE_NAME}", file or rate_hz' if is_images else "file or rate_hz, or no time"
+        raise UsageError(f"{place}: time.column is {excerpt(column)}; a stream of {stream.camera} takes {expected}.")
+    if not stream.camera and not has_time:
+        raise UsageError(
+            f'{place}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
+            "{ rate_hz = 100 }."
+        )
+    if not (stream.camera or stream.columns or stream.array):
+        raise UsageError(f'{place}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
 
 
-def _parse_time(table: Any, stream_place: str) -> Time:
-    """Return the time of a stream.
-
-    Raises `UsageError` unless it has timestamps or a rate, and for entries that do not fit.
-    """
-    place = f"{stream_place}, time"
-    time: Time = fields.build_dataclass(Time, _expect_table(table, stream_place, "time"), place, "entry")
+def _expect_time(time: Time, place: str) -> None:
+    """Raise `UsageError` unless a time has stamps or a rate, and for entries that do not fit."""
     if not time.is_declared:
         raise UsageError(f"{place}: give the column or the file with the stamps, or rate_hz.")
     repairs = [name for name in REPAIRS if getattr(time, name)]
@@ -467,7 +508,6 @@ def _parse_time(table: Any, stream_place: str) -> Time:
         raise UsageError(
             f'{place}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'
         )
-    return time
 
 
 def _expect_repairs(stream: StreamLayout, place: str) -> None:
@@ -481,12 +521,8 @@ def _expect_repairs(stream: StreamLayout, place: str) -> None:
         raise UsageError(f"{place}: time.split_at_reset is for tables of one recording, one row per time.")
 
 
-def _parse_column(value: Any, place: str) -> ColumnRule:
-    """Return a column rule. Raises `UsageError` for an invalid name pattern, and for axes or a scale that do not fit."""
-    values = dict(_expect_table(value, place, ""))
-    if "about" in values:
-        values["about"] = tuple(sorted(_expect_table(values["about"], place, "about").items()))
-    column: ColumnRule = fields.build_dataclass(ColumnRule, values, place, "entry")
+def _expect_column(column: ColumnRule, place: str) -> None:
+    """Raise `UsageError` for an invalid name pattern of a column, and for axes or a scale that do not fit."""
     placeholder_names = ("taxel", "axis") if column.shape else ()
     pattern.fill_pattern(column.name, dict.fromkeys((*pattern.placeholders(column.match), *placeholder_names), "x"))
     if column.axes and (not column.shape or len(column.axes) not in (column.shape[-1], column.shape[0])):
@@ -496,15 +532,11 @@ def _parse_column(value: Any, place: str) -> ColumnRule:
         )
     if column.type in ("bool", "text", "binary") and column.scale != 1.0:
         raise UsageError(f"{place}: scale is {column.scale}; only numbers have one.")
-    return column
 
 
 def _parse_labels(value: Any, place: str) -> LabelSource:
     """Return a source of labels. Raises `UsageError` if it is one table for all recordings without a key column."""
-    values = dict(_expect_table(value, place, ""))
-    if isinstance(values.get("columns"), list):
-        values["columns"] = tuple(values["columns"])
-    labels: LabelSource = fields.build_dataclass(LabelSource, values, place, "entry")
+    labels: LabelSource = fields.build_dataclass(LabelSource, _expect_table(value, place, ""), place, "entry")
     is_tree = labels.file.lower().endswith(TREES)  # names in a YAML or JSON file are recording names
     if not pattern.placeholders(labels.file) and not labels.key and not is_tree:
         raise UsageError(

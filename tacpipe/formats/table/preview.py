@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tacpipe.arrays import Int64s
+from tacpipe.arrays import Times
 from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.container import (
@@ -32,65 +32,7 @@ from tacpipe.formats.table.recordings import CONTAINER, RecordingFiles
 from tacpipe.plugins import failures
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
-
-MAX_DIFFERENT = 1 << 18  # maximum number of distinct steps that are counted separately
-
-
-class Steps:
-    """A histogram of the steps between timestamps; above `MOST` different steps, adjacent ones are merged.
-
-    >>> steps = Steps()
-    >>> steps.add(np.array([10, 10, 11, 70]))
-    >>> steps.median_ns(), steps.longer(30.0), steps.longest_ns()
-    (10.5, 1, 70)
-    """
-
-    def __init__(self) -> None:
-        self._waiting: list[Int64s] = []
-        self._steps: Int64s = np.zeros(0, np.int64)  # (step,), increasing
-        self._counts: Int64s = np.zeros(0, np.int64)  # (step,)
-        self._longest_ns = 0
-        self._coarse_bits = 0  # number of low bits of a step that are ignored
-
-    def add(self, steps_ns: Int64s) -> None:
-        """Count steps (time,)."""
-        self._longest_ns = max(self._longest_ns, int(steps_ns.max(initial=0)))
-        self._waiting.append(steps_ns)
-        if sum(map(len, self._waiting)) > MAX_DIFFERENT:
-            self._merge()
-
-    def _merge(self) -> None:
-        """Merge the waiting steps into the counts, ignoring low bits if there are too many distinct steps."""
-        steps_ns = np.concatenate([self._steps, *self._waiting])
-        counts = np.concatenate([self._counts, *(np.ones(len(steps_ns), np.int64) for steps_ns in self._waiting)])
-        self._waiting = []
-        while True:
-            self._steps, step_index = np.unique(steps_ns >> self._coarse_bits << self._coarse_bits, return_inverse=True)
-            if len(self._steps) <= MAX_DIFFERENT:
-                break
-            self._coarse_bits += 1
-        self._counts = np.zeros(len(self._steps), np.int64)
-        np.add.at(self._counts, step_index, counts)
-
-    def median_ns(self) -> float:
-        """Return the median step in ns, or 0 if there is no step."""
-        self._merge()
-        total = int(self._counts.sum())
-        if not total:
-            return 0.0
-        ends = np.cumsum(self._counts)
-        low, high = np.searchsorted(ends, [(total - 1) // 2, total // 2], side="right")
-        return float(self._steps[low] + self._steps[high]) / 2
-
-    def longer(self, than_ns: float) -> int:
-        """Return the number of steps longer than ``than_ns``."""
-        self._merge()
-        return int(self._counts[self._steps > than_ns].sum())
-
-    def longest_ns(self) -> int:
-        """Return the longest step."""
-        return self._longest_ns
-
+from tacpipe.signals.resampling import median_step_ns
 
 GAP = 3.0  # multiple of the median step
 SHOWN_ROWS = 3
@@ -112,7 +54,7 @@ class StreamSummary:
 
 
 def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
-    """Return a summary of a stream; batches are read one at a time.
+    """Return a summary of a stream; batches are read one at a time, and only their times stay in memory.
 
     >>> found = summarize_stream(pa.table({"t_ns": [0, 10**7, 2 * 10**7, 9 * 10**7], "a": [1, 5, 2, 3]}))
     >>> found.rows, found.rate_hz, found.gaps, found.columns["a"][3:]
@@ -120,19 +62,15 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
     """
     first_rows: pa.Table = rows.schema.empty_table()
     extremes_by_column: dict[str, list[Any]] = {}
-    first_and_last_ns: list[int] = []  # timestamps of the first and the latest row
-    count, steps = 0, Steps()
+    times: list[Times] = []
     for batch in rows.to_batches() if isinstance(rows, pa.Table) else rows:
         if not batch.num_rows:
             continue
-        count += batch.num_rows
         if first_rows.num_rows < SHOWN_ROWS:
             first_rows = pa.concat_tables([first_rows, pa.Table.from_batches([batch.slice(0, SHOWN_ROWS)])]).slice(
                 0, SHOWN_ROWS
             )
-        t_ns = batch.column(TIME).to_numpy()
-        steps.add(np.diff(t_ns, prepend=first_and_last_ns[-1]) if first_and_last_ns else np.diff(t_ns))
-        first_and_last_ns = [first_and_last_ns[0] if first_and_last_ns else int(t_ns[0]), int(t_ns[-1])]
+        times.append(batch.column(TIME).to_numpy().copy())
         for field in _measured_fields(rows.schema):
             column = batch.column(field.name)
             limits = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
@@ -141,7 +79,8 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
                 *(value for value in limits.values() if value is not None and value == value),
             ]
             extremes_by_column[field.name] = [min(values), max(values)] if values else []
-    median_step_ns = steps.median_ns()
+    t_ns: Times = np.concatenate([np.zeros(0, np.int64), *times])
+    period_ns, steps_ns = median_step_ns(t_ns), np.diff(t_ns)
     columns = {}
     for field in _measured_fields(rows.schema):
         metadata = field_metadata(field)
@@ -149,11 +88,11 @@ def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
         lowest, highest = extremes_by_column.get(field.name) or (math.nan, math.nan)
         columns[field.name] = metadata.get("quantity", ""), metadata.get("unit", ""), kind, lowest, highest
     return StreamSummary(
-        count,
-        first_and_last_ns[0] if first_and_last_ns else 0,
-        1e9 / median_step_ns if median_step_ns else 0.0,
-        steps.longer(GAP * median_step_ns),
-        steps.longest_ns() / 1e9,
+        len(t_ns),
+        int(t_ns[0]) if len(t_ns) else 0,
+        1e9 / period_ns if period_ns else 0.0,
+        int((steps_ns > GAP * period_ns).sum()),
+        int(steps_ns.max(initial=0)) / 1e9,
         columns,
         first_rows,
     )

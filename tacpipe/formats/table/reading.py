@@ -22,10 +22,10 @@ from tacpipe.formats import image_files
 from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import binary, columns, rows, stamps
 from tacpipe.formats.table.column_names import expect_short
-from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
+from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared, RowFile
 from tacpipe.formats.table.layout import StreamLayout
 from tacpipe.formats.table.repairs import StreamClock
-from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
+from tacpipe.formats.table.rows import ContainedRows, Place
 from tacpipe.formats.table.text import TextTable
 from tacpipe.io.spill import Piece, Spill, in_order
 from tacpipe.plugins.rows import drop_rows
@@ -473,7 +473,9 @@ def camera_batches(
     else from the video. Raises `TacpipeError` for unreadable videos and images, for decreasing timestamps, and if the
     numbers of timestamps and frames differ.
     """
-    images = image_files.image_paths(path) if stream.camera == "images" else []
+    images = []
+    if stream.camera == "images":
+        images = image_files.image_paths(path) if path.is_dir() else [path]
     for image in images:
         image_files.expect_complete(image)
     frames = None if images else video_files.scan(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from tacpipe.datasets.paths import refuse_shared_names, valid_name
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
 from tacpipe.formats.container import (
     EpisodeContents,
-    NamedContainer,
     container_names,
     find_containers,
     is_container,
@@ -24,7 +23,7 @@ from tacpipe.formats.container import (
 )
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
-from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout, extension
+from tacpipe.formats.table.layout import FILE, ROW, STAMPS, Format, Layout, StreamLayout, extension
 from tacpipe.formats.table.reading import (
     camera_batches,
     check_stamps,
@@ -34,7 +33,7 @@ from tacpipe.formats.table.reading import (
 )
 from tacpipe.io import files as file_system
 from tacpipe.plugins import failures
-from tacpipe.plugins.stage import Attribute, Shared
+from tacpipe.plugins.stage import Attribute, RecordingOutput, Shared
 from tacpipe.printable import listed, plain
 from tacpipe.video.files import IMAGE_CODECS
 
@@ -64,15 +63,16 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
         raise UsageError(f"{folder} is not a folder. Give the folder that the patterns of the layout start from.")
     candidates = _candidate_paths(layout, folder)
     image_folders = list(dict.fromkeys(path.parent for path in candidates if extension(path) in IMAGE_CODECS))
+    by_path = replace(layout, streams=tuple(stream for stream in layout.streams if stream not in layout.row_streams))
     matched = {
         stream.name: _matching_paths(stream, image_folders if stream.camera == "images" else candidates)
-        for stream in layout.streams
+        for stream in by_path.streams
     }
-    _refuse_unmatched(layout, matched, candidates, folder)
+    _refuse_unmatched(by_path, matched, candidates, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
     stamps: dict[Path, Path] = {}  # timestamp file by file of rows
-    for stream in layout.streams:
+    for stream in by_path.streams:
         for path, values in matched[stream.name]:
             if not set(shared) <= set(values):
                 raise UsageError(
@@ -89,7 +89,7 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
                     f"{listed(paths, 3)} are all the stream {name} of one recording ({_describe_values(shared, key)}). Add "
                     f"a placeholder to every files pattern that distinguishes them."
                 )
-        lacking = [stream.name for stream in layout.streams if not stream.optional and stream.name not in by_stream]
+        lacking = [stream.name for stream in by_path.streams if not stream.optional and stream.name not in by_stream]
         if lacking:
             present_path = next(iter(by_stream.values()))[0]
             raise UsageError(
@@ -102,7 +102,11 @@ def find_recordings(layout: Layout, folder: Path) -> list[RecordingFiles]:
             for name, (rows_path,) in by_stream.items()
             if rows_path in stamps
         }
-        sources += _recordings_in_files(layout, files, dict(zip(shared, key, strict=True)))
+        values = dict(zip(shared, key, strict=True))
+        if layout.per_row:
+            sources += _recordings_of_rows(layout, files, values, folder)
+        else:
+            sources += _recordings_in_files(layout, files, values)
     refuse_shared_names((source.name, next(iter(source.files.values()))) for source in sources)
     return sorted(sources, key=lambda source: source.name)
 
@@ -143,7 +147,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     try:
         with failures.naming_source([path]):
             container = open_container(kind, path)
-            return container.episodes() or [None], isinstance(container, NamedContainer) and container.names_itself
+            return container.episodes() or [None], container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
             raise
@@ -222,6 +226,60 @@ def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapp
         RecordingFiles(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
         for name in sorted(first)
     ]
+
+
+def _recordings_of_rows(
+    layout: Layout, files: Mapping[str, Path], values: Mapping[str, str], folder: Path
+) -> list[RecordingFiles]:
+    """Return one recording per row of a table, named after the file and the number of the row.
+
+    Cells that are labels join the ``values`` of the placeholders. Other streams have the files that the cells name.
+    Raises `UsageError` for a missing file, and `TacpipeError` for a missing column.
+    """
+    table = next(stream for stream in layout.streams if stream.name == layout.per_row)
+    cells = _cells(files[table.name], table, layout.row_columns)
+    width = len(str(len(cells)))
+    sources = []
+    for number, row in enumerate(cells, 1):
+        filled = {**values, **{name: cell for name, cell in row.items() if cell}}
+        row_files = dict(files)
+        for stream in layout.row_streams:
+            if not set(pattern.placeholders(stream.files)) <= set(filled) and stream.optional:
+                continue
+            path = folder / pattern.fill_pattern(stream.files, filled)
+            if not path.exists():
+                raise UsageError(
+                    f"{files[table.name]}, row {number}, names {path} of [streams.{stream.name}], which does not exist. "
+                    f"Copy it again, or correct files."
+                )
+            row_files[stream.name] = path
+        name = f"{number:0{width}}"
+        if layout.name:
+            name = _recording_name(layout, {**values, "recording": name}, files)
+        else:
+            name = f"{_recording_name(layout, values, {table.name: files[table.name]})}-{name}"
+        labels = {name: filled[name] for name in (*values, *layout.row_labels) if name in filled}
+        sources.append(RecordingFiles(name, row_files, labels, str(number)))
+    return sources
+
+
+def _cells(path: Path, table: StreamLayout, columns: Sequence[str]) -> list[dict[str, str]]:
+    """Return the cells of ``columns`` in each row of a table. Raises `TacpipeError` if a column is missing."""
+    with failures.naming_source([path]):
+        file = rows.open_rows(path, table)
+        names = file.names()
+        missing = [name for name in columns if name not in names]
+        if missing:
+            raise TacpipeError(
+                f"{path} has no column {listed(missing, 3)}, which [recordings] or a pattern of files names; it has "
+                f"{listed(names, 6)}."
+            )
+        blocks = list(file.batches(dict.fromkeys((*columns, ROW), pa.string())))
+        return (
+            [row for block in blocks for row in block.select([*columns]).to_pylist()]
+            if columns
+            else ([{} for block in blocks for _ in range(block.num_rows)])
+        )
 
 
 def _parts_of_file(path: Path, stream: StreamLayout, stamps_path: Path | None) -> set[str] | None:
@@ -316,22 +374,13 @@ MIN_ROWS = 10  # minimum number of rows for estimating a rate
 SKIPPED = "skipped"  # attribute that lists the unreadable sources of a recording
 
 
-@dataclass(frozen=True)
-class RecordedStreams:
-    """The streams, attributes and notes of one recording."""
-
-    streams: Mapping[str, pa.Table | pa.RecordBatchReader]
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes stored in containers
-    notes: Sequence[str] = ()  # omissions and missing parts; notes on rates are added as streams are read
-
-
 def read_streams(
     streams: Sequence[StreamLayout], paths: Mapping[str, Path], episode: str | None, shared: Shared | None = None
-) -> RecordedStreams:
+) -> RecordingOutput:
     """Return the recording with the files ``paths`` by stream. ``episode`` is its name in a file of several recordings.
 
-    Streams of a container are read in one pass. Raises the errors of `reading.stream_batches`, and one for a required
-    stream that a container lacks.
+    Streams of a container are read in one pass. Notes on rates are added as streams are read. Raises the errors of
+    `reading.stream_batches`, and one for a required stream that a container lacks.
     """
     tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
     attributes: dict[str, Attribute] = {}
@@ -372,7 +421,7 @@ def read_streams(
         for stream in streams
         if stream.name in tables
     }
-    return RecordedStreams(tables, attributes, notes)
+    return RecordingOutput(tables, attributes, notes, rows={})
 
 
 def _with_rate_note(
@@ -404,7 +453,7 @@ def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> 
         )
 
 
-def read_container(kind: str, path: Path, episode: str | None) -> RecordedStreams:
+def read_container(kind: str, path: Path, episode: str | None) -> RecordingOutput:
     """Return all readable streams of a container or of its ``episode``; the notes list the others.
 
     The attribute ``skipped`` of the recording lists them too. Raises `TacpipeError` if nothing can be read.
@@ -422,7 +471,8 @@ def read_container(kind: str, path: Path, episode: str | None) -> RecordedStream
     if not tables:
         raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
     skipped = "; ".join(f"{plain(source)}: {reason}" for source, reason in contents.skipped.items())
-    return RecordedStreams(tables, {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}, notes)
+    attributes = {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}
+    return RecordingOutput(tables, attributes, notes, rows={})
 
 
 def _skipped_notes(path: Path, skipped: Mapping[str, str]) -> list[str]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypedDict, TypeVar
+from typing import TypedDict, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -23,7 +23,8 @@ from tacpipe.arrays import Indices, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.container import SourceStream
 from tacpipe.formats.table import binary, file_sample, stamps
-from tacpipe.formats.table.layout import EXTENSIONS, StreamLayout, extension
+from tacpipe.formats.table.columns import RowFile
+from tacpipe.formats.table.layout import EXTENSIONS, ROW, StreamLayout, extension
 from tacpipe.formats.table.text import TextTable, Workbook
 from tacpipe.io import regular
 from tacpipe.io.files import Draft, Hashed
@@ -88,7 +89,7 @@ def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indice
             file.seek(offset)
             schema = pa.ipc.read_schema(owned(base64.b64decode(index["schema"])))
             table = pa.Table.from_batches([pa.ipc.read_record_batch(owned(file.read(size)), schema)])
-            yield table.drop_columns([ROW_COLUMN]), table.column(table.num_columns - 1).to_numpy()
+            yield table.select(range(table.num_columns - 1)), table.column(table.num_columns - 1).to_numpy()
 
 
 def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Iterator[tuple[str, pa.Table]]:
@@ -117,25 +118,8 @@ def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Itera
 Place = Callable[[int], str]  # maps a row of a block to its name in errors
 
 
-class RowFile(Protocol):
-    """A file of rows."""
-
-    @property
-    def path(self) -> Path:
-        """The path of the file."""
-
-    def names(self) -> list[str]:
-        """Return the names of the columns."""
-
-    def batches(self, types: Mapping[str, pa.DataType]) -> Any:
-        """Return the columns, block by block."""
-
-    def place(self, index: int) -> str:
-        """Return the name of a row in errors."""
-
-
 @dataclass(frozen=True)
-class ContainedRows:
+class ContainedRows(RowFile):
     """The rows of a container's stream, sorted by the column ``sort_column`` unless it is empty."""
 
     path: Path
@@ -161,8 +145,34 @@ class ContainedRows:
         return f"{plain(self.stream.source)}, row {index + 1}"
 
 
+@dataclass(frozen=True)
+class NumberedRows(RowFile):
+    """The rows of a file with a further column `ROW`, which numbers them from 1."""
+
+    path: Path
+    file: RowFile
+
+    def names(self) -> list[str]:
+        """Return the names of the columns."""
+        return [*self.file.names(), ROW]
+
+    def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
+        """Yield the columns in ``types``, block by block."""
+        first = 1
+        for block in self.file.batches({name: kind for name, kind in types.items() if name != ROW}):
+            numbers = pa.array(np.arange(first, first + block.num_rows)).cast(pa.string())
+            yield block.append_column(ROW, numbers) if ROW in types else block
+            first += block.num_rows
+
+    def place(self, index: int) -> str:
+        """Return the name of a row in errors."""
+        return self.file.place(index)
+
+
 def open_rows(path: Path, stream: StreamLayout) -> RowFile:
     """Return the reader of a file of this stream."""
+    if stream.recording == ROW:
+        return NumberedRows(path, open_rows(path, replace(stream, recording="")))
     kind = stream.format_of(path)
     if kind == "csv":
         return TextTable(path, stream)
@@ -181,15 +191,7 @@ def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
     stamps_layout = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
     if kind == "csv":
         lines = file_sample.first_lines(path, stream.encoding)
-        dialect = file_sample.detect_dialect(lines)
-        stamps_layout = replace(
-            stamps_layout,
-            separator=dialect.separator,
-            decimal=dialect.decimal,
-            comment=dialect.comment,
-            header=dialect.header,
-            skip_lines=dialect.skip_lines,
-        )
+        stamps_layout = replace(stamps_layout, **file_sample.detect_dialect(lines).entries)
     file = open_rows(path, stamps_layout)
     names = file.names()
     column = stream.time.column or names[0]

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 
 from tacpipe.arrays import Bools, Int64s, Times
 from tacpipe.errors import UsageError
-from tacpipe.formats.container import Time
+from tacpipe.formats.container import Time, TimeUnit
 from tacpipe.printable import excerpt
 
 if TYPE_CHECKING:
@@ -123,6 +123,8 @@ def parse_stamps(column: pa.Array, time_format: str) -> tuple[Int64s, Bools]:
 
 IN_RANGE = "a time before the year 2262"  # the limit of nanoseconds in 64 bits
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # number of decimals that are nanoseconds, by unit
+MIN_UNIX_S = 1e8  # Unix time in seconds; smaller values count from the start of a recording
+_UNIX_LIMITS: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns"))
 DECIMAL = pa.decimal128(38, 18)  # type for parsing text
 _UNIT = 10**9  # a nanosecond in units of the last digit of `DECIMAL` seconds
 _USUAL = 450_000_000  # limit of the high word of seconds (year 2233) below which products fit in 64 bits
@@ -130,6 +132,15 @@ _BEYOND = 10**37 >> 64  # value of the high word above which a time is after 226
 _MAX_STAMP = 1e19  # after 2262 in every unit, and below the smallest number that Arrow misreads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, as written by Python's logging
+
+
+def unit_of_unix_time(size: float) -> TimeUnit | None:
+    """Return the unit of a number since 1970 from its ``size``, or None for one that is too small.
+
+    >>> unit_of_unix_time(1.7e9), unit_of_unix_time(1.7e18), unit_of_unix_time(12.5)
+    ('s', 'ns', None)
+    """
+    return next((unit for limit, unit in _UNIX_LIMITS if MIN_UNIX_S <= size < limit), None)
 
 
 class StampError(ValueError):

@@ -25,7 +25,9 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats.faults import explaining
 from tacpipe.formats.table import stamps
+from tacpipe.formats.table.columns import RowFile
 from tacpipe.formats.table.layout import GZIP, StreamLayout
 from tacpipe.io import regular
 from tacpipe.io.parquet import owned
@@ -41,19 +43,17 @@ def open_text(path: Path, encoding: str = "utf-8") -> Iterator[IO[bytes]]:
 
     Raises `TacpipeError` if the file cannot be read.
     """
-    with regular.failing(path), regular.opened(path) as raw:
-        try:
-            with contextlib.ExitStack() as stack:
-                file = cast("IO[bytes]", raw)
-                if path.suffix.lower() == GZIP:
-                    file = cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=raw)))
-                yield file if is_utf8(encoding) else io.BufferedReader(_Recoded(file, encoding), RECODED_BYTES)
-        except (gzip.BadGzipFile, EOFError) as error:
-            raise TacpipeError(f"{path} is not a whole gzip file: {plain(str(error), 200)}. Copy it again.") from error
-        except UnicodeDecodeError as error:
-            raise TacpipeError(
-                f"{path} is not text in {encoding}: {plain(str(error), 200)}. Correct encoding."
-            ) from error
+    with (
+        regular.failing(path),
+        regular.opened(path) as raw,
+        explaining((gzip.BadGzipFile, EOFError), f"{path} is not a whole gzip file: ", ". Copy it again."),
+        explaining(UnicodeDecodeError, f"{path} is not text in {encoding}: ", ". Correct encoding."),
+        contextlib.ExitStack() as stack,
+    ):
+        file = cast("IO[bytes]", raw)
+        if path.suffix.lower() == GZIP:
+            file = cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=raw)))
+        yield file if is_utf8(encoding) else io.BufferedReader(_Recoded(file, encoding), RECODED_BYTES)
 
 
 def is_utf8(encoding: str) -> bool:
@@ -96,8 +96,28 @@ MAX_LINE_BYTES = 1 << 24  # a file with longer lines is not a text table
 _NOT_BLANK = re.compile(rb"\S")
 
 
+def whole_lines(
+    file: IO[bytes], block_bytes: int, max_bytes: int, too_long: TacpipeError
+) -> Iterator[tuple[bytes | memoryview, ...]]:
+    """Yield the content of a file in blocks of whole lines, each as pieces; a block of blank lines is left out.
+
+    Raises ``too_long`` for a line of more than ``max_bytes`` that does not end in a block.
+    """
+    remainder = b""
+    while new := file.read(block_bytes):
+        end = new.rfind(b"\n") + 1
+        pieces = remainder, memoryview(new)[:end]
+        if end and any(_NOT_BLANK.search(piece) for piece in pieces):
+            yield pieces
+        remainder = new[end:] if end else remainder + new
+        if len(remainder) > max_bytes:
+            raise too_long
+    if _NOT_BLANK.search(remainder):
+        yield (remainder,)
+
+
 @dataclass(frozen=True)
-class TextTable:
+class TextTable(RowFile):
     """A text file of cells, as described by a stream of the layout."""
 
     path: Path
@@ -190,23 +210,10 @@ class TextTable:
         )
         with open_text(self.path, self.stream.encoding) as file:
             self._skip_header(file)
-            remainder = b""
-            while new := file.read(BLOCK_BYTES):
-                end = new.rfind(b"\n") + 1
-                if end:
-                    yield from self._drop_matches(comment_lines, remainder, memoryview(new)[:end])
-                remainder = new[end:] if end else remainder + new
-                if len(remainder) > MAX_LINE_BYTES:
-                    raise self._endless_line()
-            yield from self._drop_matches(comment_lines, remainder)
-
-    def _drop_matches(
-        self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
-    ) -> Iterator[tuple[bytes | memoryview, ...]]:
-        """Yield pieces that end with a line, without the matches of ``drop``; nothing if no line has content."""
-        retained = pieces if drop is None else (drop.sub(b"", b"".join(pieces)),)
-        if any(_NOT_BLANK.search(piece) for piece in retained):
-            yield retained
+            for pieces in whole_lines(file, BLOCK_BYTES, MAX_LINE_BYTES, self._endless_line()):
+                retained = pieces if comment_lines is None else (comment_lines.sub(b"", b"".join(pieces)),)
+                if comment_lines is None or _NOT_BLANK.search(retained[0]):
+                    yield retained
 
     def _skip_header(self, file: IO[bytes]) -> None:
         """Skip the lines up to the first one below the header."""
@@ -232,19 +239,17 @@ class TextTable:
         """
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
-        with open_text(self.path, self.stream.encoding) as file:
-            try:
-                for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), 1):
-                    if len(line) > MAX_LINE_BYTES:
-                        raise self._endless_line()
-                    text = line.removeprefix(BOM if number == 1 else b"").decode(errors="replace").strip("\r\n")
-                    if number <= self.stream.skip_lines or not text.strip():
-                        continue
-                    if comment and text.lstrip(" \t").startswith(comment):
-                        continue
-                    yield number, next(csv.reader([text], delimiter=separator))
-            except csv.Error as error:
-                raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
+        damaged = explaining(csv.Error, f"{self.path} cannot be read: ", ". Copy it again.")
+        with open_text(self.path, self.stream.encoding) as file, damaged:
+            for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), 1):
+                if len(line) > MAX_LINE_BYTES:
+                    raise self._endless_line()
+                text = line.removeprefix(BOM if number == 1 else b"").decode(errors="replace").strip("\r\n")
+                if number <= self.stream.skip_lines or not text.strip():
+                    continue
+                if comment and text.lstrip(" \t").startswith(comment):
+                    continue
+                yield number, next(csv.reader([text], delimiter=separator))
 
     def describe_cut(self) -> list[str]:
         """Return a note if the file ends within a line whose last cell is shorter than the others of its column."""
@@ -330,7 +335,7 @@ CELL_TYPES = {"n", "s", "b", "d", "e", "str", "inlineStr"}  # ISO/IEC 29500, ST_
 
 
 @dataclass(frozen=True)
-class Workbook:
+class Workbook(RowFile):
     """One sheet of a workbook, as described by a stream of the layout."""
 
     path: Path
@@ -408,24 +413,21 @@ class Workbook:
         """
         with extras.explain_missing("Reading .xlsx"):
             import openpyxl
-        try:
-            with regular.failing(self.path), regular.opened(self.path) as file:
-                book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-                sheet = self.stream.sheet or book.sheetnames[0]
-                if sheet not in book.sheetnames:
-                    raise TacpipeError(
-                        f"{self.path} has no sheet {plain(sheet)}; it has {listed(book.sheetnames, 6)}. Correct sheet in "
-                        f"[streams.{self.stream.name}]."
-                    )
-                yield (
-                    (number, cells)
-                    for number, cells in self._numbered_rows(book[sheet])
-                    if number > self.stream.skip_lines and cells
+        damage = zipfile.BadZipFile, LookupError, ValueError, openpyxl.utils.exceptions.InvalidFileException
+        damaged = explaining(damage, f"{self.path} is not an Excel workbook: ", ". Copy it again.")
+        with damaged, regular.failing(self.path), regular.opened(self.path) as file:
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            sheet = self.stream.sheet or book.sheetnames[0]
+            if sheet not in book.sheetnames:
+                raise TacpipeError(
+                    f"{self.path} has no sheet {plain(sheet)}; it has {listed(book.sheetnames, 6)}. Correct sheet in "
+                    f"[streams.{self.stream.name}]."
                 )
-        except (zipfile.BadZipFile, LookupError, ValueError, openpyxl.utils.exceptions.InvalidFileException) as error:
-            raise TacpipeError(
-                f"{self.path} is not an Excel workbook: {plain(str(error), 200)}. Copy it again."
-            ) from error
+            yield (
+                (number, cells)
+                for number, cells in self._numbered_rows(book[sheet])
+                if number > self.stream.skip_lines and cells
+            )
 
     def _numbered_rows(self, sheet: Any) -> Iterator[tuple[int, dict[int, Any]]]:
         """Yield number and cells of each row of a sheet, as `_open_rows` does.

@@ -5,8 +5,8 @@ cursor, the legend shows and hides lines, and axes zoom with Shift and the wheel
 """
 
 from tacpipe.report.blocks import DataRow, Spec
-from tacpipe.report.charts.curves import POINTS, Curve, bars, decimated, lines
-from tacpipe.report.charts.points import Dot, grid, joined, marked, matrix, plane, ranking, scatter
+from tacpipe.report.charts.curves import POINTS, Curve, decimated, explain_lines, lines
+from tacpipe.report.charts.points import Dot, matrix, ranking, scatter
 
 __all__ = [
     "POINTS",
@@ -14,14 +14,10 @@ __all__ = [
     "DataRow",
     "Dot",
     "Spec",
-    "bars",
     "decimated",
-    "grid",
-    "joined",
+    "explain_lines",
     "lines",
-    "marked",
     "matrix",
-    "plane",
     "ranking",
     "scatter",
 ]

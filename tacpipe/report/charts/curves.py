@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from tacpipe.report.blocks import (
 
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
+DASHES = ([1, 0], [7, 3], [2, 2], [9, 3, 2, 3], [5, 2], [12, 3], [3, 5], [9, 2, 2, 2, 2, 2])  # one per colour
 DIGITS = 5  # digits per number; further digits are not visible
 FEW_STEPS = 12  # maximum number of integers on an axis that each have a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that no point is clipped
@@ -53,7 +55,7 @@ def whole_steps(values: Iterable[object]) -> ChartAxis:
     numbers = sorted({value for value in values if isinstance(value, int | float)})
     if not all(float(value).is_integer() for value in numbers):
         return {}
-    return {"tickMinStep": 1} if len(numbers) > FEW_STEPS else {"values": numbers, "format": ","}
+    return {"tickMinStep": 1} if len(numbers) > FEW_STEPS else {"values": numbers, "format": ",d"}
 
 
 def tip_of(name: str, title: str) -> ChartChannel:
@@ -86,36 +88,6 @@ def short(value: float) -> float | None:
     return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
 
 
-def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
-    """Return a chart of bars in the given order with the titles of its axes, the first ``marked`` in another colour."""
-    rows: list[DataRow] = [
-        {"x": name, "y": short(value), "kept": index < marked} for index, (name, value) in enumerate(values.items())
-    ]
-    colour: ChartChannel = {
-        "field": "kept",
-        "type": "nominal",
-        "legend": None,
-        "scale": {"domain": [True, False], "range": [BETTER, QUIET]},
-    }
-    return {
-        "data": {"values": rows},
-        "height": height,
-        "mark": {"type": "bar"},
-        "encoding": {
-            "x": {
-                "field": "x",
-                "type": "ordinal",
-                "sort": None,
-                "title": x,
-                "axis": {"labelOverlap": True, "labelAngle": 0},
-            },
-            "y": {"field": "y", "type": "quantitative", "title": y},
-            "color": colour,
-            "tooltip": [tip_of("x", x), tip_of("y", y)],
-        },
-    }
-
-
 POINTS = 300  # maximum number of points drawn per line
 ROOM = 0.02  # margin beyond the ends of a diagonal, as a fraction of its length
 
@@ -129,8 +101,6 @@ class Curve:
     y: Sequence[float] | AnyFloats
     low: Sequence[float] | AnyFloats | None = None
     high: Sequence[float] | AnyFloats | None = None
-    dashed: bool = False
-    thin: bool = False  # whether it is a single run, drawn next to a mean
 
 
 def lines(
@@ -149,46 +119,56 @@ def lines(
 ) -> Spec:
     """Return lines over x with their bands.
 
-    ``level`` is a horizontal line with its name, ``shade`` a span of x, ``floor`` the lower end of y.
+    ``level`` is a horizontal line with its name, ``shade`` a span of x. ``floor`` is the lowest value of y; arrows mark
+    values and bands that go on below it.
 
     With ``diagonal``, two numbers, a thin line x = y is drawn between them. Charts with the same ``order`` of names
-    give each name the same colour. ``points`` marks each point, ``log`` makes y logarithmic and disables the zoom.
+    give each name the same colour and dashes. ``points`` marks each point, ``log`` makes y logarithmic and disables the
+    zoom.
     """
-    names = list(order) or list(dict.fromkeys(curve.name for curve in curves if not curve.thin))
-    values = [row for number, curve in enumerate(curves) for row in _rows(curve, number)]
+    names = list(order) or list(dict.fromkeys(curve.name for curve in curves))
+    values = [row for curve in curves for row in _rows(curve, floor)]
     x_scale, y_scale = _scales(values, log=log, floor=floor, diagonal=diagonal)
-    if points:
+    if points or floor is not None:
         x_scale["padding"] = y_scale["padding"] = MARGIN
+    drawn_names = [name for name in names if name in {curve.name for curve in curves}]
     base: ChartEncoding = {
         "x": {"field": "x", "type": "quantitative", "title": x, "scale": x_scale},
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": y_scale},
-        "color": _colour(names, {curve.name for curve in curves}),
-        "detail": {"field": "run", "type": "nominal"},
+        "color": _channel_by_name(names, drawn_names, COLOURS),
         "opacity": _opacity(1, 0.07),
     }
     if axis := whole_steps(row["x"] for row in values):
         base["x"]["axis"] = axis
-    layers = [
+    dashed: ChartEncoding = {**base, "strokeDash": _channel_by_name(names, drawn_names, DASHES)}
+    layers: list[Spec] = [
         *([_span(shade)] if shade else []),
         *([diagonal_of(diagonal)] if diagonal else []),
         *([_rule(*level)] if level else []),
         *([_bands(base)] if any(curve.low is not None for curve in curves) else []),
-        *(_strokes(base, thin=thin) for thin in (True, False) if any(curve.thin is thin for curve in curves)),
+        {"mark": {"type": "line", "clip": True, "strokeWidth": 1.9}, "encoding": dashed},
     ]
     if points:
-        layers.append(
-            {
-                "transform": [{"filter": "datum.thin === false"}],
-                "mark": {"type": "circle", "size": 28, "clip": True},
-                "encoding": _point_channels(base),
-            }
-        )
+        layers.append({"mark": {"type": "circle", "size": 28, "clip": True}, "encoding": base.copy()})
+    tips = [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]
+    if any("below" in row for row in values):
+        layers.append(_arrows(base, tips))
     layers[-1]["params"] = [
         {"name": "shown", "select": {"type": "point", "fields": ["name"]}, "bind": "legend"},
         *([] if log else [zoom()]),
     ]
-    layers[-1]["encoding"]["tooltip"] = [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]
+    for layer in layers:
+        if "color" in layer["encoding"]:
+            layer["encoding"].setdefault("tooltip", tips)
     return {"data": {"values": values}, "height": height, "layer": layers}
+
+
+def explain_lines(spec: Spec, cluster: str) -> str:
+    """Return what the bands and arrows of `lines` are, if there are any; bands are over the units in ``cluster``."""
+    rows = spec["data"]["values"]
+    texts = [f"Bands: 95 % intervals over {cluster}."] if any("low" in row for row in rows) else []
+    texts += ["Arrows: a value or interval goes on below the axis."] if any("floor" in row for row in rows) else []
+    return " ".join([*texts, "Click a name to show only this line."])
 
 
 def _scales(
@@ -198,11 +178,11 @@ def _scales(
     x_scale: ChartScale = {"zero": False, "nice": False}
     y_scale: ChartScale = {"zero": False}
     if log:
-        y_scale["type"] = "log"
+        y_scale |= {"type": "log", "nice": False}
     if floor is not None:
-        cells = [row.get(key) for row in values for key in ("y", "low", "high")]
+        cells = [row.get(key) for row in values for key in ("y", "low", "high", "floor")]
         plotted_values = [cell for cell in cells if isinstance(cell, float)]
-        y_scale["domain"] = [max(floor, min([0.0, *plotted_values])), max([0.05, *plotted_values])]
+        y_scale["domain"] = [min([0.0, *plotted_values]), max([0.05, *plotted_values])]
     if diagonal:  # the margin prevents clipping of points at the ends of the diagonal
         margin = ROOM * (diagonal[1] - diagonal[0])
         y_scale["nice"] = False
@@ -210,15 +190,17 @@ def _scales(
     return x_scale, y_scale
 
 
-def _colour(names: Sequence[str], drawn: Container[str]) -> ChartChannel:
-    """Return the colours of the drawn names, by their position among all names, so that charts agree."""
-    drawn_names = [name for name in names if name in drawn]
-    colours = [COLOURS[names.index(name) % len(COLOURS)] for name in drawn_names]
+def _channel_by_name(names: Sequence[str], drawn_names: Sequence[str], values: Sequence[Any]) -> ChartChannel:
+    """Return the colours or dashes of the drawn names, by their position among all names, so that charts agree."""
+    legend = legend_of(len(drawn_names))
     return {
         "field": "name",
         "type": "nominal",
-        "scale": {"domain": drawn_names, "range": colours},
-        "legend": legend_of(len(drawn_names)),
+        "scale": {
+            "domain": list(drawn_names),
+            "range": [values[names.index(name) % len(values)] for name in drawn_names],
+        },
+        "legend": legend and {**legend, "symbolType": "stroke"},
     }
 
 
@@ -243,10 +225,12 @@ def _rule(name: str, at: float) -> Spec:
 
 def _bands(base: ChartEncoding) -> Spec:
     """Return the layer of bands between bounds."""
-    encoding = _point_channels(base)
-    encoding["y"] = {**base["y"], "field": "low"}
-    encoding["y2"] = {"field": "high"}
-    encoding["opacity"] = _opacity(0.16, 0.02)
+    encoding: ChartEncoding = {
+        **base,
+        "y": {**base["y"], "field": "low"},
+        "y2": {"field": "high"},
+        "opacity": _opacity(0.16, 0.02),
+    }
     return {
         "transform": [{"filter": "isValid(datum.low)"}],
         "mark": {"type": "area", "clip": True},
@@ -254,25 +238,18 @@ def _bands(base: ChartEncoding) -> Spec:
     }
 
 
-def _strokes(base: ChartEncoding, *, thin: bool) -> Spec:
-    """Return the layer of lines: thin ones of single runs if ``thin``, else those of all other curves."""
-    dashes: ChartScale = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
-    encoding = base.copy()
-    encoding["strokeDash"] = {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}
-    if thin:
-        encoding["opacity"] = _opacity(0.4, 0.03)
+def _arrows(base: ChartEncoding, tips: Sequence[ChartChannel]) -> Spec:
+    """Return the layer of triangles at the lower end of y, where a value or band goes on below it."""
+    encoding: ChartEncoding = {
+        **base,
+        "y": {**base["y"], "field": "floor"},
+        "tooltip": [*tips[:2], tip_of("below", str(tips[2]["title"]))],
+    }
     return {
-        "transform": [{"filter": f"datum.thin === {str(thin).lower()}"}],
-        "mark": {"type": "line", "clip": True, "strokeWidth": 0.7 if thin else 1.9},
+        "transform": [{"filter": "isValid(datum.floor)"}],
+        "mark": {"type": "point", "shape": "triangle-down", "filled": True, "size": 60},
         "encoding": encoding,
     }
-
-
-def _point_channels(base: ChartEncoding) -> ChartEncoding:
-    """Return the channels of lines without the one that separates runs."""
-    encoding = base.copy()
-    del encoding["detail"]
-    return encoding
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
@@ -297,23 +274,25 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
     return x[kept_rows], y[kept_rows]
 
 
-def _rows(curve: Curve, number: int) -> list[DataRow]:
-    """Return the points of a curve as rows, fewer if it has no band. ``number`` distinguishes curves of the same name."""
+def _rows(curve: Curve, floor: float | None) -> list[DataRow]:
+    """Return the points of a curve as rows, fewer if it has no band.
+
+    Values below ``floor`` are not drawn, and bands end there; rows with either have ``floor``, and the value as text
+    in ``below``.
+    """
     x, y = (np.asarray(values, np.float64) for values in (curve.x, curve.y))
     low, high = (None if values is None else np.asarray(values, np.float64) for values in (curve.low, curve.high))
     if low is None:
         x, y = decimated(x, y)
+    lowest = -math.inf if floor is None else floor
     rows: list[DataRow] = []
     for index, (x_value, y_value) in enumerate(zip(x, y, strict=True)):
-        row: DataRow = {
-            "name": curve.name,
-            "run": number,
-            "x": short(x_value),
-            "y": short(y_value),
-            "dashed": curve.dashed,
-            "thin": curve.thin,
-        }
-        if low is not None and high is not None and not np.isnan([low[index], high[index]]).any():
-            row |= {"low": short(low[index]), "high": short(high[index])}
+        row: DataRow = {"name": curve.name, "x": short(x_value), "y": short(y_value) if y_value >= lowest else None}
+        ends = (math.nan, math.nan) if low is None or high is None else (float(low[index]), float(high[index]))
+        if not any(map(math.isnan, ends)) and ends[1] >= lowest:
+            row |= {"low": short(max(ends[0], lowest)), "high": short(ends[1])}
+        if y_value < lowest or ends[0] < lowest:
+            interval = "" if math.isnan(ends[0]) else f" ({text_of(ends[0])} to {text_of(ends[1])})"
+            row |= {"floor": short(lowest), "below": f"{text_of(float(y_value))}{interval}"}
         rows.append(row)
     return rows

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Ints
+from tacpipe.arrays import Ints
 from tacpipe.report import blocks
 from tacpipe.report.charts.curves import (
     BETTER,
@@ -82,82 +82,6 @@ def scatter(
     return {"data": {"values": values}, "height": height, "layer": [*layers, points]}
 
 
-def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> blocks.Spec:
-    """Return a layer of diamonds at points (name, x, y), which show their numbers under the pointer."""
-    return {
-        "data": {"values": [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]},
-        "mark": {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1},
-        "encoding": {
-            "x": {"field": "x", "type": "quantitative"},
-            "y": y_of("y"),
-            "tooltip": [tip_of("name", ""), tip_of("x", x), tip_of("y", y)],
-        },
-    }
-
-
-def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> blocks.Spec:
-    """Return a layer of lines between pairs of points (name, (x, y), (x, y)), each with its name at the first point."""
-    values: list[blocks.DataRow] = [
-        {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
-        for name, start, end in pairs
-    ]
-    x: blocks.ChartChannel = {"field": "x", "type": "quantitative"}
-    rule: blocks.Spec = {
-        "mark": {"type": "rule", "stroke": INK, "strokeWidth": 0.8},
-        "encoding": {"x": x, "y": y_of("y"), "x2": {"field": "x2"}, "y2": {"field": "y2"}},
-    }
-    text: blocks.Spec = {
-        "mark": {"type": "text", "fontSize": 9, "fontWeight": 700, "fill": INK},
-        "encoding": {"x": x, "y": y_of("y"), "text": {"field": "text"}},
-    }
-    return {"data": {"values": values}, "layer": [rule, text]}
-
-
-def plane(rows: Sequence[blocks.DataRow], panels: Sequence[str], *, size: int, columns: int = 2) -> blocks.Spec:
-    """Return points in the plane with equal units on both axes, one panel per name, in this many columns.
-
-    Rows have ``x``, ``y``, ``panel``, ``strength`` (from -1 to 1, shown by the colour) and optionally ``text``, a
-    label; fields whose name starts with a capital letter are shown under the pointer.
-    """
-    values = _shorten_numbers(rows)
-    xs, ys = ([float(row[key] or 0.0) for row in rows] for key in ("x", "y"))
-    margin = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
-    domains = {
-        key: [round(min(coordinates) - margin, 3), round(max(coordinates) + margin, 3)]
-        for key, coordinates in (("x", xs), ("y", ys))
-    }
-    height_by_width = (domains["y"][1] - domains["y"][0]) / ((domains["x"][1] - domains["x"][0]) or 1.0)
-    x, y = (
-        blocks.ChartChannel(field=key, type="quantitative", axis=None, scale={"domain": domains[key], "nice": False})
-        for key in ("x", "y")
-    )
-    has_texts = any("text" in row for row in values)
-    opacity: blocks.ChartChannel = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
-    colour: blocks.ChartChannel = {"field": "side", "type": "nominal", "legend": None,
-              "scale": {"domain": ["a", "b", "c"], "range": [BETTER, WORSE, QUIET]}}  # fmt: skip
-    tips = [tip_of(name, name) for name in dict.fromkeys(key for row in values for key in row) if name[0].isupper()]
-    for row in values:
-        strength = float(row.pop("strength") or 0.0)
-        row["side"] = "a" if strength > 0 else "b" if strength < 0 else "c"
-        row["opacity"] = short(min(1.0, 0.12 + 0.78 * abs(strength))) if strength else 0.35
-    layer: list[blocks.Spec] = [
-        {"mark": {"type": "circle", "size": size, "stroke": QUIET if has_texts else None, "strokeWidth": 0.5},
-         "encoding": {"x": x, "y": y, "color": colour, "opacity": opacity, "tooltip": tips}}
-    ]  # fmt: skip
-    if has_texts:
-        layer.append({"mark": {"type": "text", "fontSize": 8.5, "fill": INK, "tooltip": None},
-                      "encoding": {"x": x, "y": y, "text": {"field": "text"}}})  # fmt: skip
-    return {
-        "data": {"values": values},
-        "columns": columns,
-        "facet": {"field": "panel", "type": "nominal", "sort": list(panels), "title": None,
-                  "header": {"labelFontWeight": 600, "labelLimit": 0, "labelPadding": 2}},
-        "spec": {"layer": layer, "view": {"stroke": None}},
-        "spacing": 12,
-        "usermeta": {"tall": short(height_by_width), "columns": columns},
-    }  # fmt: skip
-
-
 def _shorten_numbers(rows: Iterable[blocks.DataRow]) -> list[blocks.DataRow]:
     """Return rows whose numbers have only their visible digits."""
     return [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
@@ -185,7 +109,8 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
 
     ``level`` draws a line in the panel of each name, and ``row`` is the minimum height of a row in pixels.
 
-    Dots far beyond the others are drawn as triangles at the end of the axis.
+    Dots far beyond the others are drawn as triangles at the end of the axis, and so are the ends of intervals that go
+    on beyond it.
     """
     low, high = _ends(dots)
     panels = list(dict.fromkeys(estimate.panel for estimate in dots))
@@ -201,6 +126,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
                 "x": short(min(max(estimate.mean, low), high)), "mean": short(estimate.mean),
                 "low": short(min(max(estimate.low, low), high)), "high": short(min(max(estimate.high, low), high)),
                 "off": ("left" if estimate.mean < low else "right") if is_outside else "",
+                "on_left": not is_outside and estimate.low < low, "on_right": not is_outside and estimate.high > high,
                 "interval": "" if math.isnan(estimate.low) else f"{text_of(estimate.low)} to {text_of(estimate.high)}",
                 "level": short((level or {}).get(estimate.panel, math.nan)),
             }
@@ -239,6 +165,9 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
          "mark": {"type": "point", "filled": True, "size": 90, "shape": {"expr": "'triangle-' + datum.off"}, "opacity": 1},
          "encoding": {"y": y, "x": x_channel, "color": colour, "tooltip": tooltip}},
     ]  # fmt: skip
+    for side, end in (("left", "low"), ("right", "high")):
+        if any(point[f"on_{side}"] for point in values):
+            layer.append(_arrows(side, {"y": y, "x": {"field": end, "type": "quantitative"}, "color": colour}))
     if len(panels) == 1:
         return {"data": {"values": values}, "height": {"step": row_height}, "layer": layer}
     return {
@@ -250,6 +179,12 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
         "resolve": {"scale": {"y": "independent"}},
         "spacing": 6,
     }  # fmt: skip
+
+
+def _arrows(side: str, encoding: blocks.ChartEncoding) -> blocks.Spec:
+    """Return the layer of triangles at the ends of intervals that go on beyond the axis on one side."""
+    mark: blocks.ChartMark = {"type": "point", "filled": True, "size": 50, "shape": f"triangle-{side}", "opacity": 1}
+    return {"transform": [{"filter": f"datum.on_{side}"}], "mark": mark, "encoding": encoding}
 
 
 def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
@@ -269,7 +204,9 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
         1e-6,
     )
     max_distance = 6 * float(max(scales))
-    bounds = [end for dot in dots for end in (dot.mean, dot.low, dot.high) if abs(end - median_mean) <= max_distance]
+    near = [dot for dot in dots if abs(dot.mean - median_mean) <= max_distance]
+    ends = [end for dot in near for end in (dot.low, dot.high) if abs(end - median_mean) <= 3 * max_distance]
+    bounds = [*(dot.mean for dot in near), *ends]
     low, high = min(bounds), max(bounds)
     margin = 0.04 * ((high - low) or abs(high) or 1.0)
     return low - margin, high + margin
@@ -318,32 +255,3 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> blocks
             },
         ],
     }
-
-
-def grid(matrix: AnyFloats, title: str) -> blocks.Spec:
-    """Return a chart of a square matrix: a coloured square per value, blue above 0 and orange below, stronger far from 0.
-
-    Squares near 0 are omitted; both axes have the same ``title``.
-    """
-    largest = float(np.abs(matrix).max()) or 1.0
-    values: list[blocks.DataRow] = []
-    for (row, column), value in np.ndenumerate(matrix):
-        # the square root makes small values visible next to the largest
-        strength = round(math.sqrt(abs(float(value)) / largest), 2)
-        if strength >= 0.01:
-            square: blocks.DataRow = {"row": row + 1, "column": column + 1, "value": short(float(value))}
-            values.append(square | {"above": bool(value > 0), "strength": strength})
-    axis: blocks.ChartAxis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
-    return {
-        "data": {"values": values},
-        "height": {"step": 13},
-        "mark": {"type": "rect"},
-        "encoding": {
-            "y": {"field": "row", "type": "ordinal", "title": title, "axis": axis},
-            "x": {"field": "column", "type": "ordinal", "title": title, "axis": axis},
-            "opacity": {"field": "strength", "type": "quantitative", "scale": None, "legend": None},
-            "color": {"field": "above", "type": "nominal", "legend": None,
-                      "scale": {"domain": [True, False], "range": [BETTER, WORSE]}},
-            "tooltip": [tip_of("row", title), tip_of("column", title), tip_of("value", "value")],
-        },
-    }  # fmt: skip

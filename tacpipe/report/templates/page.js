@@ -25,7 +25,8 @@
     tip.style.top = `${Math.min(event.clientY + 14, innerHeight - tip.offsetHeight - 6)}px`;
   };
 
-  const options = { renderer: "svg", actions: false, defaultStyle: false, config, tooltip: showTip };
+  // ast: expressions are interpreted, because the page's policy forbids code that is made from text
+  const options = { ast: true, renderer: "svg", actions: false, defaultStyle: false, config, tooltip: showTip };
   const embed = async (plot, spec) => {
     plot.view?.finalize();
     plot.view = (await vegaEmbed(plot, spec, options)).view;
@@ -61,15 +62,13 @@
     if (!spec.facet) {
       svg = await embed(plot, { ...spec, width: wide, autosize: { type: "fit-x", contains: "padding" } });
     } else {
-      if (spec.columns) spec.columns = Math.max(1, Math.min(spec.columns, Math.floor(room / (about.least ?? 190))));
-      const columns = spec.columns ?? 1;
-      const size = (width) => { spec.spec.width = Math.max(70, width); if (about.tall) spec.spec.height = spec.spec.width * about.tall; };
-      size(Math.min(wide / columns - 14, about.panel ?? 1e4));
+      const size = (width) => { spec.spec.width = Math.max(70, width); };
+      size(wide - 14);
       for (let round = 0; round < 3; round += 1) { // the width of the labels is known only after drawing
         svg = await embed(plot, spec);
         const over = svg.getBoundingClientRect().width - wide;
-        if (over <= 0.5 && (over > -2 || about.panel)) break;
-        size(spec.spec.width - over / columns - 1);
+        if (over <= 0.5 && over > -2) break;
+        size(spec.spec.width - over - 1);
       }
     }
     svg.setAttribute("role", "img");

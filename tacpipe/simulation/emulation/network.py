@@ -1,4 +1,4 @@
-"""Emulate devices on the network: TCP servers, TCP clients for devices that connect, websockets, and UDP ports.
+"""Emulate devices on the network: TCP servers, websockets, and UDP ports.
 
 A device with a UDP port sends datagrams to the last sender, or to the port of a host that listens.
 Websockets use the protocol implementation of the package websockets without its I/O.
@@ -9,13 +9,10 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from tacpipe.links.link import Address
 from tacpipe.plugins import extras
-from tacpipe.sensors.sensor import Sensor
-from tacpipe.simulation.emulation import byte_faults
 from tacpipe.simulation.emulation.endpoint import sent_sizes
 
 HOST = "127.0.0.1"
@@ -25,13 +22,12 @@ MAX_READ_BYTES = 65_536
 class Connection:
     """A connected host."""
 
-    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+    def __init__(self, connection: socket.socket) -> None:
         """Use an accepted connection of a host without blocking."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.socket, self.device = connection, sensor.device()
-        self.pending_frames = 0
-        self.fault = byte_faults.SOUND
+        self.socket = connection
+        self.is_gone = False  # True if the host has disconnected
         self._unsent = b""  # remaining bytes of a partly sent piece
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
@@ -58,7 +54,7 @@ class Connection:
         except BlockingIOError:
             return 0
         except OSError:  # reading reports the same error
-            self.fault = byte_faults.GONE
+            self.is_gone = True
             return 0
 
     def close(self) -> None:
@@ -75,69 +71,35 @@ class Connection:
             return None
 
 
-class Registration(Connection):
-    """A connected host with a UDP port for frames. Replies use the connection."""
-
-    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
-        super().__init__(connection, sensor)
-        self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._port.setblocking(False)
-        self.host = connection.getpeername()[0]
-
-    def close(self) -> None:
-        """Close the connection and the port that sends frames."""
-        super().close()
-        self._port.close()
-
-    def post(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send frames to the host's port. Frames that the network refuses are lost."""
-        sizes = []
-        for piece in pieces:
-            try:
-                sizes.append(self._port.sendto(piece, (self.host, getattr(self.device, "port", None) or 0)))
-            except OSError:
-                sizes.append(0)
-        return sizes
-
-
 class Tcp:
     """A TCP server for any number of hosts."""
 
     scheme = "tcp"
     kind: type[Connection] = Connection
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self) -> None:
         """Start a server on a free port."""
-        self.sensor = sensor
         self.peers: list[Connection] = []
         self._server: socket.socket | None = None
         self._port = 0
-        self.replug()
+        self.start()
         self.address = Address(self.scheme, f"{HOST}:{self._port}")
 
-    def replug(self) -> None:
+    def start(self) -> None:
         """Start the server, on the same port as before."""
         if self._server is None:
             self._server = socket.create_server((HOST, self._port))
             self._server.setblocking(False)
             self._port = self._server.getsockname()[1]
 
-    def unplug(self) -> None:
+    def close(self) -> None:
         """Close all connections and the server."""
         for peer in self.peers:
-            self.leave(peer)
+            peer.close()
         self.peers = []
         if self._server is not None:
             self._server.close()
             self._server = None
-
-    def close(self) -> None:
-        """Close the server."""
-        self.unplug()
-
-    def leave(self, peer: Connection) -> None:
-        """Close a connection."""
-        peer.close()
 
     def descriptors(self) -> list[int]:
         """Return the server and its connections."""
@@ -148,7 +110,7 @@ class Tcp:
         """Accept a connection, or read from a host; return each host with its bytes, which are empty if it is new."""
         if self._server is not None and descriptor == self._server.fileno():
             try:
-                peer = self.kind(self._server.accept()[0], self.sensor)
+                peer = self.kind(self._server.accept()[0])
             except OSError:  # the host disconnected before the connection was accepted
                 return []
             self.peers = [*self.peers, peer]
@@ -162,7 +124,7 @@ class Tcp:
         """Return a host with the bytes from it; nothing if it has disconnected."""
         data = peer.read()
         if data is None:
-            self.leave(peer)
+            peer.close()
             self.peers = [existing for existing in self.peers if existing is not peer]
             return []
         return self.from_wire(peer, data)
@@ -176,21 +138,14 @@ class Tcp:
         return []
 
 
-class TcpUdp(Tcp):
-    """A TCP server for control, with frames by UDP."""
-
-    scheme = "tcp+udp"
-    kind = Registration
-
-
 class Client(Connection):
     """A host that is connected, or in the websocket handshake."""
 
-    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+    def __init__(self, connection: socket.socket) -> None:
         """Use an accepted connection for websocket messages, once its handshake is done."""
         from websockets.server import ServerProtocol
 
-        super().__init__(connection, sensor)
+        super().__init__(connection)
         self.protocol = ServerProtocol()
         self.open = False
 
@@ -219,9 +174,9 @@ class Websocket(Tcp):
     scheme = "ws"
     kind = Client
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self) -> None:
         extras.require("An emulated websocket", "websockets")
-        super().__init__(sensor)
+        super().__init__()
 
     def from_wire(self, peer: Connection, data: bytes) -> list[tuple[Connection, bytes]]:
         """Return each host's messages, and an empty one for a new connection. Answers handshakes and pings."""
@@ -252,93 +207,51 @@ class Websocket(Tcp):
 
 
 MAX_DATAGRAM_BYTES = 65_536
-MAX_QUEUED_BYTES = 65_536  # maximum number of queued bytes, of the default queue size of 200 KiB
-
-
-class Correspondent:
-    """The host that receives the datagrams."""
-
-    fault = byte_faults.SOUND
-
-    def __init__(self, endpoint: Udp, target: tuple[str, int]) -> None:
-        self.endpoint, self.target = endpoint, target
-        self.device = endpoint.sensor.device()
-        self.pending_frames = 0
-
-    def full(self) -> bool:
-        """Return whether the host's queue is so full that the kernel may drop packets."""
-        return (queued_bytes(self.target[1]) or 0) > MAX_QUEUED_BYTES
-
-    def send(self, pieces: Sequence[bytes]) -> list[int]:
-        """Send each piece as a datagram. Datagrams that the network refuses are lost."""
-        return [self.endpoint.post(piece, self.target) for piece in pieces]
 
 
 class Udp:
-    """A UDP port of a device."""
+    """A UDP port of a device, and the host that receives the datagrams."""
 
-    def __init__(self, sensor: Sensor, listener: tuple[str, int] | None = None) -> None:
+    def __init__(self, listener: tuple[str, int] | None = None) -> None:
         """Open a UDP port; datagrams are sent to ``listener`` (host, port), or without one to whoever writes first."""
-        self.sensor = sensor
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
         self._socket.setblocking(False)
-        self._unplugged = False
-        self.peers: list[Correspondent] = []
         host, port = listener or self._socket.getsockname()
         self.address = Address("udp", f"{host}:{port}")
-        if listener:
-            self.peers = [Correspondent(self, (host or HOST, port))]
+        self.target = (host or HOST, port) if listener else None  # address of the host
+        self.peers: list[Udp] = [self] if listener else []
 
     def descriptors(self) -> list[int]:
         """Return the port."""
         return [self._socket.fileno()]
 
-    def ready(self, descriptor: int) -> list[tuple[Correspondent, bytes]]:
+    def ready(self, descriptor: int) -> list[tuple[Udp, bytes]]:
         """Return the sender and a received datagram; nothing if there is none. It receives the datagrams from now on."""
         try:
-            data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
+            data, self.target = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
         except OSError:  # no datagram, or a refusal of a sent one
             return []
-        if self._unplugged:
-            return []
-        if not self.peers:
-            self.peers = [Correspondent(self, sender)]
-        self.peers[0].target = sender
-        return [(self.peers[0], data)]
+        self.peers = [self]
+        return [(self, data)]
 
-    def look(self) -> list[tuple[Correspondent, bytes]]:
+    def look(self) -> list[tuple[Udp, bytes]]:
         """Return nothing, because all events have a descriptor."""
         return []
 
-    def post(self, data: bytes, target: tuple[str, int]) -> int:
-        """Send a datagram and return the number of sent bytes."""
-        with contextlib.suppress(OSError):
-            return self._socket.sendto(data, target)
-        return 0
-
-    def unplug(self) -> None:
-        """Stop receiving and sending."""
-        self._unplugged = True
-
-    def replug(self) -> None:
-        """Restart the device."""
-        self._unplugged = False
-        for peer in self.peers:
-            peer.device = self.sensor.device()
+    def send(self, pieces: Sequence[bytes]) -> list[int]:
+        """Send each piece as a datagram, and return the number of sent bytes of each. Refused datagrams are lost."""
+        sizes = []
+        for piece in pieces:
+            try:
+                sizes.append(self._socket.sendto(piece, self.target or ("", 0)))
+            except OSError:
+                sizes.append(0)
+        return sizes
 
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
-
-
-def queued_bytes(port: int) -> int | None:
-    """Return the memory in bytes of queued datagrams at a local UDP port, or None if nobody listens."""
-    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
-        fields = line.split()
-        if int(fields[1].rpartition(":")[2], 16) == port:
-            return int(fields[4].rpartition(":")[2], 16)
-    return None
 
 
 def free_port() -> int:

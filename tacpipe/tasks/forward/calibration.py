@@ -11,7 +11,7 @@ from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.metrics.calibration import check_levels, highest_promised_level
+from tacpipe.scores.calibration import check_levels, highest_promised_level
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster

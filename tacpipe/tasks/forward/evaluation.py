@@ -17,10 +17,10 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
-from tacpipe.metrics import calibration, headline
-from tacpipe.metrics.calibration import COVERAGE_FILE, Sums
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import metrics, situations, tracks
+from tacpipe.scores import calibration, headline
+from tacpipe.scores.calibration import COVERAGE_FILE, Sums
+from tacpipe.tasks.forward import metrics, rest_shift, situations, tracks
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import (
     BASELINE,
@@ -205,6 +205,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     """
     forecaster = Forecaster.load(model)
     check_codec(model, recordings.files)
+    levels, shifts = forecaster.config.get("rest_levels"), {}
     seen_digests, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, outputs = [], {}
     bands = QuantileSums(forecaster)
@@ -220,6 +221,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             rows = _predictions(forecaster, track, trial, by_situation, spill)
             outputs[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
+            shift = levels and rest_shift.measure_shift(rest_shift.rest_level(shard, forecaster.codec.channels), levels)
+            if shift and not trial.seen:
+                shifts[name] = shift
             bands.add(track, trial)
             del track
             advance(note=name)
@@ -234,14 +238,18 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         headline.FILE: headline.write(
             metrics.headline(method, trials, forecaster.horizon, unit_of_model(forecaster.config))
         ),
-        "metrics.json": model_files.to_json(measured.to_json()),
+        "metrics.json": model_files.to_json({**measured.to_json(), **({"rest_shift": shifts} if shifts else {})}),
         "horizons.csv": metrics.horizons_csv(measured.fresh.predictors, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
         **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
-    return Result(outputs, files, look_ahead_notes(forecaster.config))
+    if shifts:
+        terminal.report_progress(rest_shift.describe_shifts(shifts))
+    unseen = [recordings.recordings[trial.name] for trial in trials if not trial.seen]
+    notes = rest_shift.shift_notes(shifts, unseen, forecaster.config.get("sessions", []))
+    return Result(outputs, files, [*look_ahead_notes(forecaster.config), *notes])
 
 
 def _predictions(

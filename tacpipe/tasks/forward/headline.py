@@ -10,15 +10,14 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.io import Json
-from tacpipe.metrics import intervals, pairing
-from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.scores import intervals, pairing
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.pairing import Measure, Sums
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.tasks.forward.params import ForwardConfig, QuantileDescription
-    from tacpipe.tasks.forward.situations import SituationMeasures
 
 COUNT, COUNTS = "count", "counts"  # unit in column names and in text
 MIXED = "own units"  # unit if channels or models differ
@@ -180,6 +179,15 @@ class QuantileMetrics:
         return {**self.description, **self.fresh, **self.parts}
 
 
+class SituationMeasures(TypedDict):
+    """Errors and skill of forecasts in one situation."""
+
+    windows: int
+    recordings: int
+    mae_counts: dict[str, dict[str, float]]  # by predictor and step
+    skill: dict[str, dict[str, float]]  # mean, lower and upper bound by step
+
+
 # recordings of known objects, of unseen objects, and recordings that the model has seen
 METRIC_PARTS = ("known", "unseen", "seen")
 
@@ -305,7 +313,7 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         (*(f"MAE {step}" for step in step_names), "squared vs persistence", "vs persistence"),
         unit,
         f"the mean absolute error as a fraction of persistence's, the geometric mean over recordings and over {all_steps} "
-        f"(1 less that: vs persistence; squared: 1 less the ratio of squared errors that are pooled over recordings)",
+        f"(squared errors are pooled over recordings)",
         "skill",
         cluster,
         error,

@@ -14,9 +14,9 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import intervals, regression
-from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.intervals import Interval
+from tacpipe.scores import intervals, regression
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.intervals import Interval
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.headline import (
     BASELINE,

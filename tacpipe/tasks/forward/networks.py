@@ -1,11 +1,9 @@
-"""Build a forecaster's network, index windows in the rows of recordings, and validate and trace the network."""
+"""Build and validate a forecaster's network, and index windows in the rows of recordings."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,13 +19,10 @@ from tacpipe.models import windows as windows_of
 from tacpipe.models.change import PlainForecast
 from tacpipe.models.forecasts import Ensemble
 from tacpipe.models.tensors import require_network, require_output
-from tacpipe.models.windows import ARM, POSE, ForecastShape, ForecastWindows
+from tacpipe.models.windows import ForecastShape, ForecastWindows
 from tacpipe.tasks.forward.params import ForwardModelParams
 from tacpipe.tasks.forward.tracks import BLOCK_ROWS, Levels, Track
 from tacpipe.training import loop
-
-if TYPE_CHECKING:
-    from tacpipe.tasks.forward.forecaster import Forecaster
 
 ACTIONS = ("planned", "none", "shuffled")
 WINDOWS = 512  # windows that are read from files at once
@@ -241,84 +236,3 @@ def check(network: nn.Module, params: ForwardModelParams, windows: ForecastWindo
     expected = (params.horizon, sample.touch.shape[1], features)
     axes = "(horizon, window, feature)"
     require_output(features_ahead, expected, params.architecture, f"{expected[1]} windows", axes)
-
-
-# number of windows on which network and trace must agree; the first calls of a trace profile and optimize it
-TRACED = 12
-# random steps between rows of test windows: in hundredths of a feature's training range, and in m
-WALK, STEP = 20.0, 0.002
-
-
-class Network:
-    """Network of a forecaster, for one window at a time.
-
-    One window is little work: more than half of a forecast's network time is spent on calling some hundred operations
-    from Python. `torch.jit.trace` and `freeze` record these calls once. A network that cannot be traced, or whose trace
-    returns different values for any test window, is called directly.
-    """
-
-    def __init__(self, forecaster: Forecaster) -> None:
-        """Trace the network, or keep the original if the trace returns different values."""
-        self._forecaster = forecaster
-        self._trace_network = None if forecaster.actions == "shuffled" else _trace_network(forecaster)
-
-    @property
-    def is_recorded(self) -> bool:
-        """Whether the traced network is used."""
-        return self._trace_network is not None
-
-    @torch.no_grad()
-    def features(self, windows: ForecastWindows) -> AnyFloats:
-        """Return the future features (window, horizon, feature), as `Forecaster.features` does, for a single window."""
-        if self._trace_network is None:
-            return self._forecaster.features(windows)
-        predicted: Tensor = self._trace_network(*windows)
-        return predicted.transpose(0, 1).numpy()
-
-
-class _Parts(nn.Module):
-    """Adapter that calls a network with the parts of windows as separate arguments."""
-
-    def __init__(self, forecaster: Forecaster) -> None:
-        super().__init__()
-        self.network, self.actions = forecaster.model, forecaster.actions
-
-    def forward(self, touch: Tensor, arm: Tensor, finger: Tensor) -> Tensor:
-        predicted: Tensor = self.network(with_actions(ForecastWindows(touch, arm, finger), self.actions))
-        return predicted
-
-
-@torch.no_grad()
-def _trace_network(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
-    """Return the traced network, or None if tracing fails or the trace does not return identical bits."""
-    parts = _Parts(forecaster).eval()
-    examples = _test_windows(forecaster)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns of shapes that become constants, which is intended here
-            traced = torch.jit.trace(parts, tuple(examples[0]), check_trace=False)  # type: ignore[no-untyped-call]
-            frozen: torch.jit.ScriptModule = torch.jit.freeze(traced)
-            for _ in range(2):  # during and after optimization of the trace
-                if not all(torch.equal(frozen(*windows), parts(*windows)) for windows in examples):
-                    return None
-    except Exception:  # an architecture from another package may raise any error
-        return None
-    return frozen
-
-
-def _test_windows(forecaster: Forecaster) -> list[ForecastWindows]:
-    """Return test windows, one per item, with random walks, rest, jumps and constant values."""
-    rng = np.random.default_rng(0)
-    context, rows = forecaster.context, forecaster.context + forecaster.horizon
-    examples = []
-    for number in range(TRACED):
-        size = 0.0 if number == 0 else float(rng.lognormal(0, 1))
-        moved = rng.random((context, 1, 1)) < rng.random()  # rows that are not moved repeat the previous row
-        walk = WALK * rng.normal(0, size, (context, 1, len(forecaster.codec.latents))) * moved
-        touch = walk.cumsum(axis=0) * forecaster.feature_half / 100
-        arm = rng.normal(0, STEP * size, (rows, 1, ARM)).cumsum(axis=0)
-        arm[..., 3:POSE] += forecaster.orientation
-        arm[..., 3:POSE] /= np.linalg.norm(arm[..., 3:POSE], axis=-1, keepdims=True)
-        finger = 0.04 + rng.normal(0, STEP * size, (context, 1)) * moved[:, 0]
-        examples.append(ForecastWindows(*(torch.from_numpy(part.astype(np.float32)) for part in (touch, arm, finger))))
-    return examples

@@ -15,7 +15,8 @@ from tacpipe.channels import arm
 from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import Dropout, PositiveFloat, PositiveInt, Seed
 from tacpipe.plugins.params import Panels, added
-from tacpipe.plugins.stage import Channels, Label, Presets, Requirements
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Presets
 from tacpipe.tasks.task import ModelConfig
 from tacpipe.training.devices import Precision
 
@@ -227,6 +228,20 @@ class LookAhead(TypedDict):
     max_ms: float
 
 
+class TrainingRest(TypedDict):
+    """Rest levels of the training recordings, in a model's configuration."""
+
+    mean: list[float]  # (channel,)
+    deviation: list[float]  # (channel,), standard deviation over recordings
+
+
+class RestShift(TypedDict):
+    """Distance of a recording's rest levels from the training mean, in standard deviations of the training recordings."""
+
+    largest: float  # over channels
+    median: float
+
+
 class QuantileDescription(TypedDict):
     """Calibration of a model's quantiles, in its configuration."""
 
@@ -253,6 +268,8 @@ class ForwardConfig(ModelConfig):
     objects: list[str]
     counts: dict[str, dict[str, int]]
     baselines: NotRequired[dict[str, float]]
+    rest_levels: NotRequired[TrainingRest]
+    sessions: NotRequired[list[str]]  # sessions of training and validation recordings; absent: unknown
     quantiles: NotRequired[QuantileDescription]
 
 
@@ -298,6 +315,11 @@ REQUIREMENTS = Requirements(
             "object",
             "the grasped object, any value",
             "Without it, known and novel objects are not reported separately.",
+        ),
+        Label(
+            "session",
+            "the day or the mounting of the sensors, any text",
+            "Without it, test recordings of a training session are not noted.",
         ),
     ),
 )

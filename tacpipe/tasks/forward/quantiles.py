@@ -21,9 +21,9 @@ from torch.nn import functional
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Float32s, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.calibration import conformal_quantile, pinball, promised_quantile
 from tacpipe.models.tensors import tensors_under
 from tacpipe.models.windows import POSE, ForecastWindows, without_plan
+from tacpipe.scores.calibration import conformal_quantile, pinball, promised_quantile
 from tacpipe.tasks import task
 
 HIDDEN = 32
@@ -271,7 +271,7 @@ class ForecastQuantiles:
 
         Each quantile is shifted until the fraction of calibration values at or below it equals its level, with equal
         weight for each recording: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019),
-        separately for each side, with the pooled CDFs of recordings (`tacpipe.metrics.calibration`). With ``promised``,
+        separately for each side, with the pooled CDFs of recordings (`tacpipe.scores.calibration`). With ``promised``,
         pairs of quantiles are shifted together so that the band between them contains the values of a new recording
         with at least its level's probability; raises `TacpipeError` if there are too few recordings.
         """

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, TypedDict
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
-from tacpipe.metrics import intervals, regression
-from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.scores import intervals, regression
+from tacpipe.tasks.forward.headline import BASELINE, MODEL, SituationMeasures
 
 if TYPE_CHECKING:  # these modules import torch, which a report does not need
     from tacpipe.tasks.forward.predictors import Prediction
@@ -24,15 +24,6 @@ SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in moti
 WIDTH_M = 0.0005  # minimum change of the gripper's width that counts as closing or opening
 LOST = 0.05  # fraction of the load lost over the future rows when an object slips
 PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # minimum speeds of a moving hand
-
-
-class SituationMeasures(TypedDict):
-    """Errors and skill of forecasts in one situation."""
-
-    windows: int
-    recordings: int
-    mae_counts: dict[str, dict[str, float]]  # by predictor and step
-    skill: dict[str, dict[str, float]]  # mean, lower and upper bound by step
 
 
 class Motion(NamedTuple):

@@ -11,9 +11,9 @@ from tacpipe.tasks.forward.params import REQUIREMENTS, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
+    from tacpipe.report.context import TaskReport
     from tacpipe.tasks.forward.prediction import ForwardModel
     from tacpipe.tasks.recordings import OpenedChain
 
@@ -22,9 +22,10 @@ class ForwardTask(Task):
     """Forecasts of tactile signals."""
 
     name = "forward"
+    requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=6, requirements=REQUIREMENTS)
+    @stage(version=8)
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 
@@ -105,7 +106,8 @@ def demo(output: Path) -> Demo:
     ]
     shortened = [f"{paths['model']} (6 of 16 epochs)", f"{paths['paper-model']} (6 of 50 epochs)"]
     results = [paths["results"], paths["paper-results"]]
-    return Demo(commands, results, recorded=chain(output), shortened=shortened)
+    simulated = ["simulate", "forward", "--trials", "4", "--same-skins"]
+    return Demo(commands, results, recorded=chain(output), simulated=simulated, shortened=shortened)
 
 
 def chain(output: Path) -> list[list[str]]:

@@ -13,7 +13,7 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.channels import arm as poses
 from tacpipe.channels import streams
 from tacpipe.channels.arm import Pose
-from tacpipe.channels.schema import field_metadata
+from tacpipe.channels.schema import field_metadata, is_truth
 from tacpipe.channels.streams import missing_channel_error
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import tactile
@@ -120,7 +120,6 @@ POSED = len(POSE)  # number of pose columns of ``ARM``, which velocities follow
 FINGER = "robot_finger_m"
 JOINTS = 7
 BY_POSES = "differences of poses"  # source of a plan's velocities, as written in models
-TRUTH = "gt_"  # prefix of the simulator's ground truth, which no model may read
 
 
 @dataclass(frozen=True)
@@ -249,8 +248,8 @@ def inputs(table: pa.Table | Columns, names: Sequence[str]) -> AnyFloats:
 def _check_inputs(schema: pa.Schema, names: Sequence[str]) -> None:
     """Raise `TacpipeError` if a column is absent or belongs to the simulator's ground truth."""
     for name in names:
-        if name.startswith(TRUTH):
-            raise TacpipeError(f"{name} is the simulator's ground truth; a model that reads it has learned nothing.")
+        if name in schema.names and is_truth(schema.field(name)):
+            raise TacpipeError(f"{name} is ground truth; a model that reads it has learned nothing.")
         if name not in schema.names:
             raise TacpipeError(
                 f"There is no column {name}. Give recordings of the same streams and columns as the model's, that went "

@@ -29,7 +29,7 @@ from tacpipe.models.forecasts import Shrunk, persistence_weights
 from tacpipe.models.linear import CHUNK, FittedBaselines, WindowArrays
 from tacpipe.models.windows import ForecastWindows, motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import headline, networks, tracks
+from tacpipe.tasks.forward import headline, networks, rest_shift, tracks
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
     CONFIG,
@@ -137,9 +137,14 @@ def train(
     }
     if look_ahead := _training_look_ahead(training):
         config["look_ahead"] = look_ahead
+    if levels := rest_shift.training_levels(training, codec.channels):
+        config["rest_levels"] = levels
+    if sessions := rest_shift.sessions([*training.recordings.values(), *validation.recordings.values()]):
+        config["sessions"] = sessions
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
-        linear = FittedBaselines.fit(_linear(training_rows), _linear(validation_rows))
+        recordings = validation_rows.recording_of(validation_rows.evenly_spread(LINEAR)).numpy()
+        linear = FittedBaselines.fit(_linear(training_rows), _linear(validation_rows), recordings)
         config["baselines"] = linear.settings
         files[BASELINES] = save_arrays(
             {name: np.ascontiguousarray(array) for name, array in linear.to_tensors().items()}

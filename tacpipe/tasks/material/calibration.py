@@ -14,9 +14,9 @@ from tacpipe.arrays import AnyArray, Bools, Float32s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics import calibration
-from tacpipe.metrics.headline import MIN_CLUSTERS
-from tacpipe.metrics.intervals import share_interval, wilson
+from tacpipe.scores import calibration
+from tacpipe.scores.headline import MIN_CLUSTERS
+from tacpipe.scores.intervals import share_interval, wilson
 from tacpipe.tasks.material.classifier import CONFIG, UNKNOWN_ANSWER, Classifier
 from tacpipe.tasks.material.headline import MaterialMetrics, ProbabilityMeasures, StatedProbabilities, UnknownMeasures
 from tacpipe.tasks.material.params import UnknownDescription

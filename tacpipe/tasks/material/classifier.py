@@ -16,7 +16,6 @@ from tacpipe.arrays import Bools, Float32s, Floats, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.models.readout import Level, StatisticsClassifier
 from tacpipe.models.recurrent_autoencoder import AutoencoderShape
@@ -24,6 +23,7 @@ from tacpipe.models.tensors import tensors_under
 from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
+from tacpipe.scores import calibration
 from tacpipe.tasks.material import estimators
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import FittedEstimator

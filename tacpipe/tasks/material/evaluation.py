@@ -16,10 +16,10 @@ from tacpipe.datasets import model_files, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
-from tacpipe.metrics import headline
-from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Result
 from tacpipe.printable import listed
+from tacpipe.scores import headline
+from tacpipe.scores.intervals import mcnemar, wilson
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, Classifier, ReaderOutput

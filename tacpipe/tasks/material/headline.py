@@ -13,18 +13,30 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyArray, AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
-from tacpipe.metrics import pairing
-from tacpipe.metrics.calibration import ConfidenceBin
-from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
+from tacpipe.scores import pairing
+from tacpipe.scores.calibration import ConfidenceBin
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.pairing import Measure, Sums
 from tacpipe.tasks.material.params import KEY, StoredNaming
 
 TASK = "material"
 CHANCE = "chance"
 # baselines; other predictors are controls or the model itself
 BASELINES = {"mean_level": "mean level alone", "level_only": "same readout of the level alone"}
+
+
+SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
+
+
+def sensor_title(sensor: str) -> str:
+    """Return the display name of a sensor.
+
+    >>> sensor_title("biotac"), sensor_title("xela1")
+    ('BioTac', 'xela1')
+    """
+    return SENSORS.get(sensor, sensor)
 
 
 def headline(
@@ -47,7 +59,7 @@ def headline(
         baselines[CHANCE] = {
             key: np.array([slide_sums[1] / classes, slide_sums[1]]) for key, slide_sums in model_sums.items()
         }
-    return pairing.headline(TASK, method, MEASURE, model_sums, baselines, part=sensor, runs=runs)
+    return pairing.headline(TASK, method, MEASURE, model_sums, baselines, part=sensor_title(sensor), runs=runs)
 
 
 def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:

@@ -35,10 +35,10 @@ from scipy.special import logsumexp
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int32s, Int64s, Ints
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import Rocket, with_profile
 from tacpipe.models.readout import statistics
 from tacpipe.models.tensors import tensors_under
+from tacpipe.scores import calibration
 
 COMPONENTS = 300  # maximum number of components
 PATTERNS = "patterns."  # prefix of the tensor names of patterns

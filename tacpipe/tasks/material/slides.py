@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
+from tacpipe.channels.schema import field_metadata, is_truth
 from tacpipe.channels.streams import missing_channel_error
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
@@ -137,7 +138,7 @@ def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[st
     present_quantities: set[str] = set()
     for shard in first.values():
         schema = shard.table(STREAM if STREAM in shard.streams else "").schema
-        present_quantities |= {(field.metadata or {}).get(b"quantity", b"").decode() for field in schema}
+        present_quantities |= {field_metadata(field).get("quantity", "") for field in schema if not is_truth(field)}
     return [quantity for quantity in quantities if quantity not in present_quantities]
 
 
@@ -149,8 +150,11 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Sl
             f"Run `tacpipe segment slides` first."
         )
     table = shard.table(STREAM if STREAM in shard.streams else "")
-    quantity_bytes = {quantity.encode() for quantity in quantities}
-    channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in quantity_bytes]
+    channels = [
+        field.name
+        for field in table.schema
+        if field_metadata(field).get("quantity") in quantities and not is_truth(field)
+    ]
     if not channels:
         raise missing_channel_error(shard.name, " or ".join(quantities), table.schema)
     values = _columns(table, channels)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.material.params import KEY, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
+    from tacpipe.report.context import TaskReport
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.recordings import OpenedChain
 
@@ -86,9 +87,10 @@ class MaterialTask(Task):
     """Classify materials."""
 
     name = "material"
+    requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=1, requirements=REQUIREMENTS)
+    @stage(version=2)
     def train(
         params: Params, train: Dataset, val: Dataset | None, workspace: Workspace, init: Model | None = None
     ) -> Result:

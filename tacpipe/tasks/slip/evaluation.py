@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.arrays import Floats
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import combine_origins
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import headline, pairing
-from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.scores import headline, pairing
+from tacpipe.scores.pairing import Sums
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
-from tacpipe.tasks.slip.metrics import WindowScores
+from tacpipe.tasks.slip.metrics import PARTS, QUESTIONS, AreaLayout, WindowScores
 from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.scorers import CONSTANT, score_baselines
 from tacpipe.tasks.slip.training import TASK, labelled_tracks, score_windows, scored_tracks
-from tacpipe.tasks.slip.windows import STABLE, TrainingWindows, match_time, read_windows
+from tacpipe.tasks.slip.windows import STABLE, TrainingWindows, read_windows
 
 MODEL = "model"
 WINDOWS, EVENTS = "windows", "events.json"
@@ -39,7 +40,7 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
             "No recording has labels of slips, except those that the model was trained on. Give recordings with the role "
             "test, with labels."
         )
-    windows = read_windows(model.reader, tracks, replace(model.params, match_time=True))
+    windows = read_windows(model.reader, tracks, model.params)
     scores = {MODEL: score_windows(model.scorer, windows), **score_baselines(model.baselines, windows.features)}
     base_rate = float(model.config["base_rate"])
     probabilities = {
@@ -50,7 +51,6 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
     levels = {MODEL: model.calibration.levels, **model.config["baseline_levels"]}
     evaluated = EvaluatedSlips.from_windows(windows, scores, probabilities, levels)
     architecture = str(model.config["architecture"])
-    compared = headline_of(architecture, evaluated)
     origin = combine_origins(recordings.recordings[track.name].attributes for track in evaluated.tracks)
     return Result(
         {WINDOWS: RecordingOutput(evaluated.to_table(), origin)},
@@ -58,8 +58,9 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
             model_files.CONFIG: files[model_files.CONFIG],
             "metrics.json": model_files.to_json(evaluated.measure(model.horizon_ns)),
             EVENTS: evaluated.events_json(),
-            headline.FILE: headline.write([compared] if compared else []),
+            headline.FILE: headline.write(headlines_of(architecture, evaluated)),
         },
+        model.notes(),
     )
 
 
@@ -73,6 +74,9 @@ class EvaluatedSlips:
     # recording -> predictor -> false alarms per minute -> level
     levels: Mapping[str, Mapping[str, Mapping[str, float]]]
     known_objects: frozenset[str] = frozenset()  # objects of the recordings that the model was trained on
+    folds: tuple[
+        int, ...
+    ] = ()  # recording -> its fold, if there are several; scores of different folds are not compared
 
     @classmethod
     def from_windows(
@@ -94,7 +98,7 @@ class EvaluatedSlips:
         )
 
     def pooled(self, others: Sequence[EvaluatedSlips]) -> EvaluatedSlips:
-        """Return this evaluation together with those of further folds, with weights that match times over all folds.
+        """Return this evaluation together with those of further folds.
 
         A recording that several folds test (``split --apart object``) counts once, if possible in a fold that did not train
         on its object.
@@ -104,20 +108,15 @@ class EvaluatedSlips:
             for index, track in enumerate(fold.tracks):
                 if track.name not in fold_and_index or track.object not in fold.known_objects:
                     fold_and_index[track.name] = (fold, index)
-        tracks = [fold.tracks[index] for fold, index in fold_and_index.values()]
-        since_s = np.concatenate([np.zeros(0), *(track.since_s for track in tracks)])
-        slips = np.concatenate([np.zeros(0, bool), *(track.states > STABLE for track in tracks)])
-        weights = match_time(since_s, slips)
-        ends = np.cumsum([len(track.t_ns) for track in tracks])[:-1]
-        matched = [
-            replace(track, weights=track_weights)
-            for track, track_weights in zip(tracks, np.split(weights, ends), strict=True)
-        ]
         folds = fold_and_index.values()
+        tracks = tuple(fold.tracks[index] for fold, index in folds)
+        numbers = {id(fold): number for number, fold in enumerate((self, *others))}
         scores = {name: tuple(fold.scores[name][index] for fold, index in folds) for name in self.scores}
         probabilities = {name: tuple(fold.probabilities[name][index] for fold, index in folds) for name in self.scores}
         levels = {name: fold.levels[name] for name, (fold, _) in fold_and_index.items()}
-        return EvaluatedSlips(tuple(matched), scores, probabilities, levels)
+        return EvaluatedSlips(
+            tracks, scores, probabilities, levels, folds=tuple(numbers[id(fold)] for fold, _ in folds)
+        )
 
     def scored_by(self, predictor: str) -> list[ScoredTrack]:
         """Return the recordings with the scores of a predictor."""
@@ -125,27 +124,56 @@ class EvaluatedSlips:
             replace(track, scores=scores) for track, scores in zip(self.tracks, self.scores[predictor], strict=True)
         ]
 
+    @property
+    def objects(self) -> dict[str, str]:
+        """The object of each recording."""
+        return {track.name: track.object for track in self.tracks}
+
+    @functools.cached_property
+    def layout(self) -> AreaLayout:
+        """The places of sums for the objects of these recordings alone."""
+        return AreaLayout(self.objects.values())
+
+    @functools.cached_property
+    def own_sums(self) -> dict[str, dict[str, Sums]]:
+        """The `sums` in the `layout` of these recordings."""
+        return self.sums(self.layout)
+
+    def sums(self, layout: AreaLayout, parts: Collection[str] = PARTS) -> dict[str, dict[str, Sums]]:
+        """Return the sums of each recording (`AreaLayout`) by predictor and part of `PARTS`."""
+        folds = self.folds or (0,) * len(self.tracks)
+        by_predictor: dict[str, dict[str, Sums]] = {name: {part: {} for part in parts} for name in self.scores}
+        for name, sums in by_predictor.items():
+            tracks = list(zip(folds, self.scored_by(name), self.probabilities[name], strict=True))
+            for number in sorted(set(folds)):
+                windows = WindowScores([track for fold, track, _ in tracks if fold == number])
+                probabilities = metrics.joined(values for fold, _, values in tracks if fold == number)
+                for part in parts:
+                    sums[part] = {**sums[part], **windows.sums(part, layout, probabilities)}
+        return by_predictor
+
     def measure(self, horizon_ns: int) -> dict[str, Any]:
         """Return the metrics of each predictor, and the margin of the model over each baseline."""
-        windows = {name: WindowScores(self.scored_by(name)) for name in self.scores}
+        measure, sums, windows = self.layout.measure(), self.own_sums, WindowScores(self.tracks)
         by_predictor: dict[str, Any] = {}
-        for name, own in windows.items():
-            probabilities = np.concatenate([np.zeros(0), *self.probabilities[name]])
-            brier = metrics.brier(probabilities, own.states > STABLE, own.weights)
+        for name, parts in sums.items():
+            probabilities = metrics.joined(self.probabilities[name])
+            brier = metrics.brier(probabilities, windows.states > STABLE, windows.weights)
             by_predictor[name] = {
-                "auc": metrics.areas(own),
+                "auc": metrics.areas(parts, measure, self.objects),
                 "brier": float(f"{brier:.6g}") if brier == brier else None,
-                "accuracy": metrics.accuracy(probabilities, own),
+                "accuracy": metrics.accuracy(probabilities, windows),
                 "alarms": self.alarms(name, horizon_ns),
             }
             if name != MODEL:
-                by_predictor[name]["margin"] = metrics.margin(windows[MODEL], own)
+                margin = pairing.difference(measure, sums[MODEL]["before"], parts["before"], self.objects)
+                by_predictor[name]["margin"] = metrics.to_json(margin)
         counts = {
             "recordings": len(self.tracks),
-            "objects": windows[MODEL].object_count,
+            "objects": windows.object_count,
             "slips": sum(len(track.events) for track in self.tracks),
-            "windows": len(windows[MODEL].scores),
-            "before": int((windows[MODEL].states > STABLE).sum()),
+            "windows": len(windows.scores),
+            "before": int((windows.states > STABLE).sum()),
         }
         return {**by_predictor, "counts": counts, "parts": metrics.PARTS}
 
@@ -160,15 +188,6 @@ class EvaluatedSlips:
             for rate in rates
         }
 
-    def sums(self, predictor: str) -> Sums:
-        """Return the weighted sum of squared errors of probabilities, and the weights, by recording."""
-        return {
-            (0, track.name): np.array(
-                [(track.weights * np.square(values - (track.states > STABLE))).sum(), track.weights.sum()]
-            )
-            for track, values in zip(self.tracks, self.probabilities[predictor], strict=True)
-        }
-
     def to_table(self) -> pa.Table:
         """Return the table of all windows."""
         sizes = [len(track.t_ns) for track in self.tracks]
@@ -178,6 +197,7 @@ class EvaluatedSlips:
             "t_ns": pa.array(np.concatenate([track.t_ns for track in self.tracks]), pa.int64()),
             "since_s": pa.array(np.concatenate([track.since_s for track in self.tracks])),
             "state": pa.array(np.concatenate([track.states for track in self.tracks]), pa.int8()),
+            "weight": pa.array(np.concatenate([track.weights for track in self.tracks])),
         }
         for name in self.scores:
             table[f"score_{name}"] = pa.array(np.concatenate(self.scores[name]))
@@ -194,7 +214,7 @@ class EvaluatedSlips:
 
     @classmethod
     def from_result(cls, result: Dataset) -> EvaluatedSlips:
-        """Return the evaluation that is stored in a result, with weights that match times over all its folds."""
+        """Return the evaluation that is stored in a result."""
         table = result.recordings[WINDOWS].table()
         events_by_recording = model_files.tree(result.files, EVENTS)
         names = table["recording"].to_numpy(zero_copy_only=False)
@@ -214,7 +234,7 @@ class EvaluatedSlips:
                     values["state"][rows].astype(np.int64),
                     values[f"score_{MODEL}"][rows],
                     slips,
-                    np.ones(len(rows)),
+                    values["weight"][rows],
                     since_s,
                 )
             )
@@ -224,41 +244,21 @@ class EvaluatedSlips:
 
         levels = {name: described["levels"] for name, described in events_by_recording.items()}
         known = frozenset(model_files.tree(result.files, model_files.CONFIG, {"objects": list})["objects"])
-        return cls(tuple(tracks), column_by_track("score"), column_by_track("probability"), levels, known).pooled([])
+        return cls(tuple(tracks), column_by_track("score"), column_by_track("probability"), levels, known)
 
 
-def brier_measure() -> Measure:
-    """Return the `Measure` that turns sums (draw, [sum of squared errors, sum of weights]) into Brier scores."""
+def headlines_of(method: str, evaluated: EvaluatedSlips) -> list[headline.Headline]:
+    """Return the areas under the curve of the model next to those of its baselines for each of `QUESTIONS`.
 
-    def error(sums: AnyFloats) -> AnyFloats:
-        return np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1e-12), np.nan)
-
-    def gain(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-        return np.where(baseline > 0, 1 - model / np.where(baseline > 0, baseline, 1), np.nan)
-
-    return Measure(
-        ("Brier score",),
-        "squared probability",
-        "the Brier score",
-        "skill",
-        "objects",
-        error,
-        gain,
-        lambda sums: (float(error(sums[None])[0]),),
-        scored="Brier score",
-        weight=lambda draws: draws[:, 1],
-        reference="time only",
-    )
-
-
-def headline_of(method: str, evaluated: EvaluatedSlips) -> headline.Headline | None:
-    """Return the Brier score of the model next to those of its baselines, with the interval over objects.
-
-    None if no baseline can be compared.
+    The intervals are over objects. A question without pairs of windows is omitted.
     """
-    baselines: dict[str, Sums] = {
-        name.replace("_", " "): evaluated.sums(name) for name in evaluated.scores if name != MODEL
-    }
-    objects = {track.name: track.object for track in evaluated.tracks}
-    measure = brier_measure()
-    return pairing.headline(TASK, method, measure, evaluated.sums(MODEL), baselines, clusters=objects)
+    measure, sums = evaluated.layout.measure(), evaluated.own_sums
+    headlines = []
+    for part, target in QUESTIONS.items():
+        baselines = {name.replace("_", " "): sums[name][part] for name in sums if name != MODEL}
+        compared = pairing.headline(
+            TASK, method, measure, sums[MODEL][part], baselines, target=target, clusters=evaluated.objects
+        )
+        if compared and np.isfinite(compared.model.values[0]):
+            headlines.append(compared)
+    return headlines

@@ -1,28 +1,27 @@
 """Measure scores of slips: area under the curve by kind of window, lead times, and intervals over objects.
 
-Intervals of areas are jackknife intervals over objects on the scale of log odds, with Student's t. An area is a sum over
-pairs of objects, so leaving out an object removes its row and its column of pairs (Obuchowski, Nonparametric analysis of
-clustered ROC curve data, Biometrics 53, 1997). ``docs/benchmarks/intervals.md`` has their coverage.
+An area is a sum over pairs of objects, so leaving out an object removes its row and its column of pairs (Obuchowski,
+Nonparametric analysis of clustered ROC curve data, Biometrics 53, 1997). ``docs/benchmarks/intervals.md`` has the coverage
+of the intervals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, TypedDict
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s
-from tacpipe.metrics.intervals import MIN_INTERVAL_CLUSTERS, Jackknife, effective_number, share_interval
+from tacpipe.scores import pairing
+from tacpipe.scores.intervals import Estimate, share_interval
+from tacpipe.scores.pairing import Gain, Measure, Sums
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
 
 LEADS_S = (0.2, 0.5, 1.0)  # times before the start of a slip at which the area under the curve is measured
 LEAD_WIDTH_S = 0.1  # half the width of the windows around such a time
 EARLY_S = (2.0, 3.0)  # times before the start of a slip of the control of windows that are too early
-ROUNDING = 1e-9  # standard error up to which it counts as zero
-SMALLEST_SHARE = 1e-3  # minimum share, and minimum distance from 1, for the transformation to log odds
 SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 PARTS = {  # kinds of windows of the area under the curve -> meaning
@@ -32,6 +31,9 @@ PARTS = {  # kinds of windows of the area under the curve -> meaning
     "within": "windows before a slip against earlier windows of the same recording: the moment, not the grasp",
     **{f"lead {lead:g} s": f"windows {lead:g} s before a slip, against matched stable contact" for lead in LEADS_S},
 }
+
+# parts that are questions with a verdict -> question
+QUESTIONS = {"before": "risk of a slip", "during": "detection of a slip", "within": "moment of a slip"}
 
 
 class ObjectEstimate(TypedDict):
@@ -57,38 +59,46 @@ class SlipAlarmScore(TypedDict):
     detected_ratio: ObjectEstimate
 
 
-@dataclass(frozen=True)
-class Area:
-    """An area under the curve as sums by object, from which that of any selection of objects follows."""
+class AreaLayout:
+    """Places of the sums of a recording that determine areas, for all objects of the results that are compared."""
 
-    wins: Floats  # (object of the slip, object of the stable contact), weighted pairs in which the slip scores higher
-    positives: Floats  # (object,), weight of windows with a slip
-    negatives: Floats | None  # (object,), weight of stable windows; None if pairs are within one object
+    def __init__(self, objects: Iterable[str]) -> None:
+        """Give each object its place in the sums."""
+        self.index = {name: index for index, name in enumerate(sorted(set(objects)))}
+        count = len(self.index)
+        # weighted pairs won by the recording's slips against each object's stable contact, all such pairs, the recording's
+        # object, the weights of its stable contact, and for the Brier score the weighted squared error and the weight
+        self.wins, self.pairs, self.present = (slice(at * count, (at + 1) * count) for at in range(3))
+        self.stable, self.squared, self.weight = range(3 * count, 3 * count + 3)
 
-    @property
-    def value(self) -> float:
-        """The area over all objects; NaN without pairs."""
-        return float(self.selected(np.ones((1, len(self.positives))))[0])
-
-    @property
-    def without(self) -> Floats:
-        """The area without each object (object,)."""
-        return self.selected(1 - np.eye(len(self.positives)))
-
-    @property
-    def effective(self) -> float:
-        """The effective number of objects: that of slips or of stable contact, whichever is smaller."""
-        parts = [self.positives] if self.negatives is None else [self.positives, self.negatives]
-        return min(float(effective_number(part)) for part in parts)
-
-    def selected(self, objects: Floats) -> Floats:
-        """Return the area (selection,) of objects, for the number of each in each selection (selection, object)."""
-        if self.negatives is None:
-            won, pairs = objects @ np.diag(self.wins), objects @ self.positives
-        else:
-            won = ((objects @ self.wins) * objects).sum(axis=1)
-            pairs = (objects @ self.positives) * (objects @ self.negatives)
+    def area(self, sums: AnyFloats) -> AnyFloats:
+        """Return areas under the curve (draw,) of sums (draw, part); NaN without pairs. Only present objects count."""
+        present = sums[:, self.present] > 0
+        won, pairs = ((sums[:, part] * present).sum(axis=1) for part in (self.wins, self.pairs))
         return np.where(pairs > 0, won / np.where(pairs > 0, pairs, 1), np.nan)
+
+    def measure(self) -> Measure:
+        """Return the `Measure` of these sums."""
+
+        def values(sums: AnyFloats) -> tuple[float, ...]:
+            brier = sums[self.squared] / sums[self.weight] if sums[self.weight] else np.nan
+            return float(self.area(sums[None])[0]), float(brier)
+
+        return Measure(
+            ("area under the curve", "Brier score"),
+            "area under the ROC curve, and squared probability",
+            "the area under the curve",
+            "area",
+            "objects",
+            lambda sums: 1 - self.area(sums),
+            lambda errors, baseline: baseline - errors,
+            values,
+            lambda errors: 1 - errors,
+            "area under the curve",
+            rises=True,
+            weight=lambda sums: np.stack([sums[:, self.pairs].sum(axis=1), sums[:, self.stable]], axis=1),
+            reference="time only",
+        )
 
 
 def _wins(slips: AnyFloats, stable: AnyFloats, weights: AnyFloats) -> Floats:
@@ -111,11 +121,11 @@ class WindowScores:
         names = sorted({track.object for track in self.tracks})
         self.objects = np.array([names.index(track.object) for track in self.tracks], np.intp)[self.recording]
         self.object_count = len(names)
-        self.scores = _joined([track.scores for track in self.tracks])
-        self.states = _joined([track.states for track in self.tracks]).astype(np.int64)
-        self.weights = _joined([track.weights for track in self.tracks])
-        self.until_s = _joined([_until_next(track) for track in self.tracks])
-        self.has_slip = _joined([np.full(len(track.t_ns), bool(len(track.events))) for track in self.tracks]) > 0
+        self.scores = joined([track.scores for track in self.tracks])
+        self.states = joined([track.states for track in self.tracks]).astype(np.int64)
+        self.weights = joined([track.weights for track in self.tracks])
+        self.until_s = joined([_until_next(track) for track in self.tracks])
+        self.has_slip = joined([np.full(len(track.t_ns), bool(len(track.events))) for track in self.tracks]) > 0
 
     def part(self, name: str) -> tuple[Bools, Bools]:
         """Return which windows a part of `PARTS` counts, and which of them are positive (window,)."""
@@ -133,37 +143,47 @@ class WindowScores:
         before = (self.states == BEFORE) & (np.abs(self.until_s - lead_s) <= LEAD_WIDTH_S)
         return before | stable, before
 
-    def area(self, name: str) -> Area:
-        """Return the area under the curve of a part, as sums by object.
+    def sums(self, name: str, layout: AreaLayout, probabilities: Floats) -> Sums:
+        """Return the sums of each recording (`AreaLayout`) for a part of `PARTS`, and ``probabilities`` (window,) of slips.
 
-        Windows of the part within are compared in each recording only.
+        Windows of the part within are compared in each recording only, with equal weight for each window before a slip.
         """
         counted, positive = self.part(name)
         weights = np.ones(len(self.scores)) if name in ("within", "early") else self.weights
         negative = counted & ~positive
-        positives, negatives = (np.zeros(self.object_count) for _ in range(2))
-        np.add.at(positives, self.objects[positive], weights[positive])
-        np.add.at(negatives, self.objects[negative], weights[negative])
+        squared = weights * np.square(probabilities - (self.states > STABLE))
+        rows = np.zeros((len(self.tracks), layout.weight + 1))
+        objects = [layout.index[track.object] for track in self.tracks]
+        rows[np.arange(len(objects)), layout.present.start + np.array(objects, np.intp)] = 1
+        for column, values, chosen in (
+            (layout.stable, weights, negative),
+            (layout.squared, squared, counted),
+            (layout.weight, weights, counted),
+        ):
+            np.add.at(rows[:, column], self.recording[chosen], values[chosen])
         if name == "within":
-            return self._within(counted, positive)
-        wins = np.zeros((self.object_count, self.object_count))
-        for number in np.unique(self.objects[negative]).tolist():
-            rows = negative & (self.objects == number)
-            gained = _wins(self.scores[positive], self.scores[rows], weights[rows])
-            np.add.at(wins[:, number], self.objects[positive], gained * weights[positive])
-        return Area(wins, positives, negatives)
+            self._add_pairs_within(rows, layout, counted, positive)
+        else:
+            slip_weights = np.bincount(self.recording[positive], weights[positive], len(self.tracks))
+            for number in sorted(set(objects)):
+                stable = negative & (np.array(objects, np.intp)[self.recording] == number)
+                wins = _wins(self.scores[positive], self.scores[stable], weights[stable])
+                np.add.at(rows[:, layout.wins.start + number], self.recording[positive], wins * weights[positive])
+                rows[:, layout.pairs.start + number] = slip_weights * weights[stable].sum()
+        return {(0, track.name): row for track, row in zip(self.tracks, rows, strict=True)}
 
-    def _within(self, counted: Bools, positive: Bools) -> Area:
-        """Return the mean of the areas of recordings, weighted by their windows before a slip."""
-        wins, totals = np.zeros((self.object_count, self.object_count)), np.zeros(self.object_count)
+    def _add_pairs_within(self, rows: AnyFloats, layout: AreaLayout, counted: Bools, positive: Bools) -> None:
+        """Add the pairs of windows of the same recording to ``rows`` (recording, part)."""
+        rows[:, layout.stable] = 0
         for number in np.unique(self.recording[counted & positive]).tolist():
-            rows = counted & (self.recording == number)
-            before, earlier = (self.scores[rows & kind] for kind in (positive, ~positive))
+            own = counted & (self.recording == number)
+            before, earlier = (self.scores[own & kind] for kind in (positive, ~positive))
             if len(earlier):
-                owner = int(self.objects[rows][0])
-                wins[owner, owner] += _wins(before, earlier, np.full(len(earlier), 1 / len(earlier))).sum()
-                totals[owner] += len(before)
-        return Area(wins, totals, None)
+                place = layout.index[self.tracks[number].object]
+                rows[number, layout.wins.start + place] = _wins(
+                    before, earlier, np.full(len(earlier), 1 / len(earlier))
+                ).sum()
+                rows[number, layout.pairs.start + place] = rows[number, layout.stable] = len(before)
 
 
 def _until_next(track: ScoredTrack) -> Floats:
@@ -173,27 +193,9 @@ def _until_next(track: ScoredTrack) -> Floats:
     return np.where(following == starts[-1], np.inf, (following - track.t_ns) / 1e9)
 
 
-def _joined(parts: Sequence[AnyFloats | Bools | Int64s]) -> AnyFloats:
+def joined(parts: Iterable[AnyFloats | Bools | Int64s]) -> Floats:
+    """Return arrays joined to one, also if there is none."""
     return np.concatenate([np.zeros(0), *parts])
-
-
-def estimate(value: float, without: AnyFloats, effective: float, *, is_share: bool = False) -> ObjectEstimate:
-    """Return a value with its interval from the values without each object (object,); NaN becomes null.
-
-    ``effective`` is the effective number of objects. A share, such as an area, is transformed to log odds, because its
-    distribution is skewed near 0 and 1. There is no interval if no object changes the value.
-    """
-    values, mean = (_log_odds(without), _log_odds(value)) if is_share else (without, np.asarray(value))
-    influence = values.mean() - values
-    error = np.sqrt((len(values) - 1) / max(len(values), 1) * np.square(influence).sum())
-    freedom = effective - 1 if effective >= MIN_INTERVAL_CLUSTERS else np.nan
-    ends = (
-        Jackknife(np.atleast_1d(mean), np.atleast_1d(error), np.array([freedom]), influence[:, None]).interval().first
-    )
-    low, high = (ends.low, ends.high) if error > ROUNDING else (np.nan, np.nan)
-    if is_share:
-        low, high = (float(1 / (1 + np.exp(-end))) for end in (low, high))
-    return _rounded(value, low, high)
 
 
 def ratio_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
@@ -201,35 +203,21 @@ def ratio_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
     sums = np.stack([np.bincount(owners, part, count) for part in (flags, np.ones(len(flags)))])[:, :, None]
     with_items = sums[1, :, 0] > 0
     ends = share_interval(sums[0, with_items], sums[1, with_items]).first
-    is_certain = ends.low == ends.high
-    return _rounded(ends.mean, *((np.nan, np.nan) if is_certain else (ends.low, ends.high)))
+    return to_json(ends)
 
 
-def _log_odds(share: AnyFloats | float) -> Floats:
-    limited = np.clip(share, SMALLEST_SHARE, 1 - SMALLEST_SHARE)
-    odds: Floats = np.log(limited / (1 - limited))
-    return odds
+def to_json(estimate: Estimate | Gain) -> ObjectEstimate:
+    """Return a value and its interval with 6 digits; NaN becomes null."""
+    value, low, high = (
+        float(f"{number:.6g}") if np.isfinite(number) else None
+        for number in (estimate.mean, estimate.low, estimate.high)
+    )
+    return {"value": value, "low": low, "high": high}
 
 
-def _rounded(value: float, low: float, high: float) -> ObjectEstimate:
-    texts = [float(f"{number:.6g}") if np.isfinite(number) else None for number in (value, low, high)]
-    return {"value": texts[0], "low": texts[1], "high": texts[2]}
-
-
-def areas(windows: WindowScores) -> dict[str, ObjectEstimate]:
-    """Return the area under the curve of each part, with intervals over objects."""
-    return {name: area_estimate(windows.area(name)) for name in PARTS}
-
-
-def area_estimate(area: Area) -> ObjectEstimate:
-    """Return an area under the curve with its interval over objects."""
-    return estimate(area.value, area.without, area.effective, is_share=True)
-
-
-def margin(model: WindowScores, baseline: WindowScores, name: str = "before") -> ObjectEstimate:
-    """Return by how much the area of a model exceeds that of a baseline, with its interval over the same objects."""
-    first, second = model.area(name), baseline.area(name)
-    return estimate(first.value - second.value, first.without - second.without, first.effective)
+def areas(sums: Mapping[str, Sums], measure: Measure, objects: Mapping[str, str]) -> dict[str, ObjectEstimate]:
+    """Return the area under the curve of each part, with intervals over objects; ``objects`` are those of recordings."""
+    return {name: to_json(pairing.score(measure, part, objects)) for name, part in sums.items()}
 
 
 def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:

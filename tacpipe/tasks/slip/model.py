@@ -17,12 +17,13 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks import recordings as recordings_of
+from tacpipe.tasks.learning.inputs import InputStream
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.slip.calibration import SlipCalibration
 from tacpipe.tasks.slip.params import SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.scorers import Scorer, load_baseline
+from tacpipe.tasks.slip.scorers import BEST_FEATURE, LinearScorer, Scorer, load_baseline
 from tacpipe.tasks.slip.training import BASELINES, MODEL, labelled_tracks, score_windows, scored_tracks
-from tacpipe.tasks.slip.windows import Finger, FingerReader, GraspTrack, read_windows
+from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, read_windows
 from tacpipe.tasks.task import CalibrationRequest, Files
 
 NEEDED: Mapping[str, model_files.Kind] = {
@@ -57,7 +58,7 @@ class SlipModel:
         config = model_files.tree(files, model_files.CONFIG, NEEDED)
         with model_files.validated("the model"):
             params = params_of.from_json(registry.load("train.slip"), config["params"])
-            fingers = tuple(Finger.from_config(finger) for finger in config["fingers"])
+            fingers = tuple(InputStream.from_config(finger) for finger in config["fingers"])
             if not fingers:
                 raise ValueError("the model reads no finger")
             reader = FingerReader(fingers, round(params.rest_s * 1e9), params.reads_plans)
@@ -71,6 +72,14 @@ class SlipModel:
     def horizon_ns(self) -> int:
         """How far ahead the probability reaches."""
         return round(self.params.horizon_s * 1e9)
+
+    def notes(self) -> list[str]:
+        """Return a note on the feature of the baseline `BEST_FEATURE`; an empty list for models without this baseline."""
+        scorer = self.baselines.get(BEST_FEATURE)
+        if not isinstance(scorer, LinearScorer):
+            return []
+        name, direction = self.reader.names[scorer.columns[0]], "larger" if scorer.weights[0] > 0 else "smaller"
+        return [f"The baseline {BEST_FEATURE.replace('_', ' ')} is {name}, {direction} before slips."]
 
     def predict(self, recordings: Dataset | Recording) -> dict[str, pa.Table] | pa.Table:
         """Return a table with one row per sample of the first finger with full windows; by name for a dataset.

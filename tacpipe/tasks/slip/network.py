@@ -63,7 +63,7 @@ def stack_windows(windows: Sequence[AnyFloats], reader: FingerReader) -> Float32
     """
     parts = list(windows)
     if reader.reads_plans:
-        rows = reader.fingers[0].rows
+        rows = reader.streams[0].rows
         parts[-1] = np.nan_to_num(parts[-1][:, np.linspace(0, parts[-1].shape[1] - 1, rows).astype(np.intp)])
     joined = np.concatenate([np.clip(part, -LIMIT, LIMIT) for part in parts], axis=2)
     return np.ascontiguousarray(joined.transpose(0, 2, 1), np.float32)
@@ -71,7 +71,7 @@ def stack_windows(windows: Sequence[AnyFloats], reader: FingerReader) -> Float32
 
 def input_count(reader: FingerReader) -> int:
     """Return the number of channels of `stack_windows`."""
-    return sum(len(finger.channels) for finger in reader.fingers) + len(CHANNELS) * reader.reads_plans
+    return sum(len(finger.channels) for finger in reader.streams) + len(CHANNELS) * reader.reads_plans
 
 
 class WindowWork:
@@ -104,7 +104,7 @@ class WindowWork:
     def shape(self) -> tuple[int, int]:
         """Channels and rows of a window."""
         reader = self.windows.reader
-        return input_count(reader), reader.fingers[0].rows
+        return input_count(reader), reader.streams[0].rows
 
     def batches(self, epoch: int) -> list[Tensor]:
         """Return shuffled batches of indices of the training windows."""
@@ -207,7 +207,7 @@ class ConvolutionScorer:
 
 def _require_equal_rows(reader: FingerReader) -> None:
     """Raise `TacpipeError` if fingers have windows of different lengths."""
-    rows = {finger.rows for finger in reader.fingers}
+    rows = {finger.rows for finger in reader.streams}
     if len(rows) > 1:
         raise TacpipeError(
             f"The network reads fingers of the same rate, and these have windows of {sorted(rows)} rows. Synchronize the "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypedDict
 
+from tacpipe.datasets import manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import (
     Names,
@@ -23,6 +24,7 @@ from tacpipe.tasks.task import ModelConfig
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyArray
+    from tacpipe.tasks.learning.inputs import StreamConfig
     from tacpipe.tasks.slip.scorers import Scorer
     from tacpipe.tasks.slip.training import SlipTraining
     from tacpipe.tasks.slip.windows import FingerReader
@@ -138,7 +140,6 @@ class ForecastRule(SlipModelParams):
         """
         if not self.forward_model:
             return
-        from tacpipe.datasets import manifest
 
         digest = manifest.find(_path(self.forward_model)).digest
         if self.forward_digest not in ("", digest):
@@ -171,17 +172,6 @@ def _path(text: str) -> Path:
 Params = SlipModelParams  # params of any architecture
 
 
-class FingerConfig(TypedDict):
-    """A tactile stream that a model reads."""
-
-    stream: str
-    channels: list[str]
-    layout: list[dict[str, str]]  # taxel and axis of each channel, if its metadata contains them
-    rows: int  # number of rows of a window
-    rate_hz: float
-    scale: list[float]  # (channel,), the divisor of values above rest
-
-
 class CalibrationConfig(TypedDict):
     """A monotone map from scores to probabilities, and the alarm levels that follow from it."""
 
@@ -195,7 +185,7 @@ class CalibrationConfig(TypedDict):
 class SlipConfig(ModelConfig):
     """``config.json`` of a slip model."""
 
-    fingers: list[FingerConfig]
+    fingers: list[StreamConfig]
     rate_hz: float  # rate of the first finger's rows, each of which gets a probability
     objects: list[str]  # objects of the training recordings
     counts: dict[str, int]  # numbers of training recordings, windows and slips

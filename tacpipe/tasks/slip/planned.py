@@ -15,7 +15,7 @@ from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory, PosePlan
 from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.sensors.plan import NAME as PLAN
-from tacpipe.tasks.slip.features import EPSILON, NAMES
+from tacpipe.tasks.learning.features import EPSILON, NAMES
 
 STEP_NS, POINTS = 20_000_000, 50  # times after a row at which a plan is sampled: one second
 SMALLEST_STEP_NS = 10_000_000  # time between two points of a plan below which the later one is left out

@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question, TaskReport
+from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report.blocks import NONE, Cell, Fold, fixed, fold, notes, table
-from tacpipe.report.context import Context
-from tacpipe.tasks.slip.evaluation import EVENTS, MODEL, WINDOWS, EvaluatedSlips, brier_measure
-from tacpipe.tasks.slip.metrics import PARTS, ObjectEstimate
+from tacpipe.report.context import Context, TaskReport
+from tacpipe.tasks.slip.evaluation import EVENTS, MODEL, WINDOWS, EvaluatedSlips
+from tacpipe.tasks.slip.metrics import PARTS, QUESTIONS, AreaLayout, ObjectEstimate
 
 ALARM_HEADS = {
     "minutes": "minutes of stable contact",
@@ -23,7 +23,8 @@ ALARM_HEADS = {
     "median_to_end_ms": "median time to its end (ms)",
 }
 NOTE = (
-    "Windows of stable contact are weighted to have the same times since the start as windows before or during a slip. "
+    "Windows of stable contact are weighted as in training: unless match_time is off, they have the same times since the "
+    "start as windows before or during a slip. Areas compare scores of one model only and are averaged over folds. "
     "Intervals are over objects. The windows 2 to 3 s before a slip and those within recordings are controls: a model of "
     "the weak grasp is good at the first, poor at the second."
 )
@@ -36,17 +37,21 @@ class SlipReport(TaskReport):
 
     def read(self, results: Sequence[Dataset]) -> list[ComparedRun]:
         """Return one run per result."""
+        stored = [
+            (result, EvaluatedSlips.from_result(result))
+            for result in results
+            if WINDOWS in result.recordings and EVENTS in result.files
+        ]
+        layout = AreaLayout(name for _, evaluated in stored for name in evaluated.objects.values())
+        measure = layout.measure()
         runs = []
-        for result in results:
-            if WINDOWS not in result.recordings or EVENTS not in result.files:
-                continue
+        for result, evaluated in stored:
             config = json.loads(result.files["config.json"])
-            evaluated = EvaluatedSlips.from_result(result)
-            sums = {
-                name: {recording: parts for (_, recording), parts in evaluated.sums(name).items()}
-                for name in evaluated.scores
-            }
-            objects = {track.name: track.object for track in evaluated.tracks}
+            sums = evaluated.sums(layout, QUESTIONS)
+            questions = {}
+            for place, (part, target) in enumerate(QUESTIONS.items()):
+                rows = {name: {key[1]: row for key, row in parts[part].items()} for name, parts in sums.items()}
+                questions[Question(target=target, place=place)] = PredictorErrors(measure, rows, evaluated.objects)
             settings = {name: value for name, value in config["params"].items() if name not in ("architecture", "seed")}
             runs.append(
                 ComparedRun(
@@ -54,7 +59,7 @@ class SlipReport(TaskReport):
                     self.name,
                     config["architecture"],
                     settings,
-                    {Question("unseen recordings"): PredictorErrors(brier_measure(), sums, objects)},
+                    questions,
                     seed=config["params"]["seed"],
                     fold=min(evaluated.levels, default=""),
                     control=config["params"].get("labels") == "shuffled",

@@ -20,10 +20,11 @@ import tacpipe
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
 from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
-from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Model, Recording
 from tacpipe.errors import TacpipeError
+from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.slip.windows import FingerReader, GraspTrack
+from tacpipe.tasks.task import PredictionRequest, task_of_model
 
 STEPS = (1, 3, 5, 10)  # steps ahead of the forecasts
 SMALLEST_LOAD = 1e-3  # minimum divisor, as a fraction of the largest load of a recording
@@ -76,12 +77,9 @@ class RuleScorer:
 
     def forecasts(self, recording: Recording) -> pa.Table:
         """Return the forecasts of a recording, with the metadata of their columns, which `ForwardModel.predict` lacks."""
-        from tacpipe.tasks.recordings import OpenedChain, open_for_model
-        from tacpipe.tasks.task import PredictionRequest
-
         model = self._forward_model
         opened = open_for_model(recording, OpenedChain(model))
-        result = model_files.task(model.files, self.path).predict(model, opened, PredictionRequest(STEPS))
+        result = task_of_model(model.files, self.path).predict(model, opened, PredictionRequest(STEPS))
         (output,) = result.recordings.values()
         rows = output.streams[""]
         return rows if isinstance(rows, pa.Table) else rows.read_all()

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices
-from tacpipe.tasks.slip.boosting import BoostedTrees
+from tacpipe.models.boosting import BoostedTrees, TreeSizes
+from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, standardise
 from tacpipe.tasks.slip.planned import NAMES_OF_PLAN
 from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, TrainingWindows
 
 if TYPE_CHECKING:
     from tacpipe.tasks.slip.params import Boosting
 
-LINEAR = "linear"  # name of the linear baseline
+LINEAR, BEST_FEATURE = "linear", "best_feature"  # names of the baselines of logistic regression
 PENALTY = 0.01  # L2 penalty on the weights of the linear baseline, relative to the mean error of a window
-LARGEST = 10.0  # maximum standardised feature, to which the linear baseline clips
 
 
 class Scorer(Protocol):
@@ -97,17 +97,8 @@ class BoostedScorer(FeatureScorer):
         Columns without two different values are left out.
         """
         chosen = _varying_columns(windows, columns)
-        trees = BoostedTrees.fit(
-            windows.features[:, chosen],
-            windows.slips,
-            windows.weights,
-            trees=params.trees,
-            leaves=params.leaves,
-            leaf=params.leaf,
-            learning_rate=params.learning_rate,
-            l2=params.l2,
-            seed=params.seed,
-        )
+        sizes = TreeSizes(params.trees, params.leaves, params.leaf, params.learning_rate, params.l2, params.seed)
+        trees = BoostedTrees.fit(windows.features[:, chosen], windows.slips, windows.weights, sizes)
         return cls(chosen, trees)
 
     def score_features(self, features: Floats) -> Floats:
@@ -135,22 +126,25 @@ class LinearScorer(FeatureScorer):
     base: Floats  # (1,), the log odds of a window of mean features
 
     @classmethod
-    def fit(cls, windows: TrainingWindows) -> LinearScorer:
-        """Return a scorer trained on all features but the time. Missing features count as their mean."""
+    def fit(cls, windows: TrainingWindows, columns: Sequence[int] | None = None) -> LinearScorer:
+        """Return a scorer trained on columns of the features, by default all but the time.
+
+        Missing features count as their mean. Columns without two different values are left out.
+        """
         from sklearn.linear_model import LogisticRegression
 
-        columns = _varying_columns(windows)
+        columns = _varying_columns(windows, columns)
         counted = windows.weights > 0
         rows = windows.features[counted][:, columns]
-        means, deviations = np.nanmean(rows, axis=0), np.maximum(np.nanstd(rows, axis=0), 1e-12)
+        means, deviations = np.nanmean(rows, axis=0), np.maximum(np.nanstd(rows, axis=0), SMALLEST_DEVIATION)
         weights = windows.weights[counted]
         model = LogisticRegression(C=1 / (PENALTY * weights.sum()), max_iter=1000)
-        model.fit(_standardise(rows, means, deviations), windows.slips[counted], sample_weight=weights)
+        model.fit(standardise(rows, means, deviations), windows.slips[counted], sample_weight=weights)
         return cls(columns, means, deviations, model.coef_[0].astype(np.float64), model.intercept_.astype(np.float64))
 
     def score_features(self, features: Floats) -> Floats:
         """Return the log odds (row,) of features (row, feature), the last of which is the time."""
-        rows = _standardise(features[:, self.columns], self.means, self.deviations)
+        rows = standardise(features[:, self.columns], self.means, self.deviations)
         scores: Floats = (rows * self.weights).sum(axis=1) + self.base[0]
         return scores
 
@@ -167,12 +161,6 @@ class LinearScorer(FeatureScorer):
         if set(shapes.values()) - {(len(columns),)} - {(1,)} or shapes["base"] != (1,):
             raise ValueError(f"a regression of {shapes} for {len(columns)} columns")
         return cls(columns, **parts)
-
-
-def _standardise(rows: Floats, means: Floats, deviations: Floats) -> Floats:
-    """Return features (row, column) in standard deviations from their means, limited, 0 where they are missing."""
-    standard = np.ascontiguousarray((rows - means) / deviations)
-    return np.nan_to_num(np.clip(standard, -LARGEST, LARGEST))
 
 
 def _stored_columns(described: Mapping[str, Any], reader: FingerReader) -> tuple[int, ...]:
@@ -199,20 +187,46 @@ BaselineFit = Callable[[TrainingWindows, str], FeatureScorer]  # windows and the
 
 
 def baseline_fits(reader: FingerReader, sizes: Boosting) -> dict[str, BaselineFit]:
-    """Return the function that trains each baseline: trees of these sizes on few columns, and a linear model of all."""
+    """Return the function that trains each baseline: trees of these sizes on few columns, and the regressions.
+
+    The regressions are a linear model of all features, and the best feature, whose regression only turns it into log odds.
+    """
 
     def boost(columns: Sequence[int]) -> BaselineFit:
         return lambda windows, name: BoostedScorer.fit(windows, sizes, columns)
 
     fits = {name: boost(columns) for name, columns in baseline_columns(reader).items()}
-    return {**fits, LINEAR: lambda windows, name: LinearScorer.fit(windows)}
+    return {
+        **fits,
+        LINEAR: lambda windows, name: LinearScorer.fit(windows),
+        BEST_FEATURE: lambda windows, name: LinearScorer.fit(windows, [best_column(windows)]),
+    }
+
+
+def best_column(windows: TrainingWindows) -> int:
+    """Return the column, except the time, that best separates windows with a slip from others, without training.
+
+    It has the largest weighted area under the curve, of its values or of their negatives: whichever are larger on average
+    in windows with a slip. A regression on this column has the same direction.
+    """
+    from sklearn.metrics import roc_auc_score
+
+    counted = windows.weights > 0
+    slips, weights = windows.slips[counted], windows.weights[counted]
+    areas = {}
+    for column in _varying_columns(windows):
+        values = windows.features[counted, column]
+        values = standardise(values, np.nanmean(values), max(np.nanstd(values), SMALLEST_DEVIATION))
+        slipping, stable = (np.average(values[part], weights=weights[part]) for part in (slips, ~slips))
+        areas[column] = roc_auc_score(slips, np.sign(slipping - stable) * values, sample_weight=weights)
+    return max(areas, key=lambda column: areas[column])
 
 
 def load_baseline(
     name: str, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], reader: FingerReader
 ) -> FeatureScorer:
     """Return a stored baseline. Raises `ValueError` if its parts do not fit one another."""
-    kind = LinearScorer if name == LINEAR else BoostedScorer
+    kind = LinearScorer if name in (LINEAR, BEST_FEATURE) else BoostedScorer
     return kind.load(arrays, described, reader)
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.slip.params import Params
 from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
+    from tacpipe.report.context import TaskReport
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.slip.model import SlipModel
 
@@ -60,9 +61,10 @@ class SlipTask(Task):
     """Predict slips of a held object."""
 
     name = "slip"
+    requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=2, requirements=REQUIREMENTS, reads=("object", "slip_intervals"))
+    @stage(version=4, reads=("object", "slip_intervals"))
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 

@@ -17,6 +17,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.tasks import recordings
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
 from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule, SlipConfig, SlipModelParams
+from tacpipe.tasks.slip.rule import RuleScorer
 from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, baseline_fits
 from tacpipe.tasks.slip.windows import (
     FingerReader,
@@ -52,8 +53,6 @@ class SlipTraining:
 
     def apply_rule(self, params: ForecastRule) -> Scorer:
         """Return the rule on forecasts, which learns nothing."""
-        from tacpipe.tasks.slip.rule import RuleScorer
-
         return RuleScorer(params.forward_model, params.forward_digest)
 
 
@@ -90,8 +89,8 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
         "architecture": stored["architecture"],
         "params": stored,
         "trained_on": recordings.trained_on_datasets(training, *([validation] if validation is not None else [])),
-        "fingers": [finger.to_config() for finger in reader.fingers],
-        "rate_hz": reader.fingers[0].rate_hz,
+        "fingers": [finger.to_config() for finger in reader.streams],
+        "rate_hz": reader.streams[0].rate_hz,
         "objects": sorted({track.object for track in tracks}),
         "counts": counts,
         "calibration": calibration.to_config(),

@@ -18,9 +18,9 @@ from tacpipe.datasets import selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
-from tacpipe.metrics import headline, regression
-from tacpipe.metrics.calibration import COVERAGE_FILE
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.scores import headline, regression
+from tacpipe.scores.calibration import COVERAGE_FILE
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import quantiles

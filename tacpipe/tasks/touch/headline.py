@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.metrics import pairing
-from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.pairing import Measure, Sums
+from tacpipe.scores import pairing
+from tacpipe.scores.headline import Headline
+from tacpipe.scores.pairing import Measure, Sums
 
 TASK = "touch"
 PARTS = {True: "known objects", False: "novel objects", None: "all objects"}

@@ -13,8 +13,8 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics.calibration import check_levels
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.scores.calibration import check_levels
 from tacpipe.tasks import recordings
 from tacpipe.tasks.recordings import open_for_model
 from tacpipe.tasks.task import CalibrationRequest

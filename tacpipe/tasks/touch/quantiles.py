@@ -3,7 +3,7 @@
 There are too few grasps to learn a spread for each one. So errors are divided by the value's standard deviation over
 training grasps, and quantiles are computed over all values of a target, with equal weight for each calibration grasp.
 This is split conformal prediction with normalised errors (Papadopoulos, Gammerman and Vovk, 2008), over groups
-(`tacpipe.metrics.calibration`).
+(`tacpipe.scores.calibration`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import model_files
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import calibration
-from tacpipe.metrics.calibration import Sums
 from tacpipe.models.tensors import tensors_under
+from tacpipe.scores import calibration
+from tacpipe.scores.calibration import Sums
 from tacpipe.tasks import task
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN

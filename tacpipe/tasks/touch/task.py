@@ -6,14 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Channels, Label, Requirements, Result, Workspace, stage
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.task import Calibration, Demo, Files, GraspPredictor, PredictionRequest, Task
 from tacpipe.tasks.touch.params import Params
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.runs import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.settings import LiveTask
+    from tacpipe.report.context import TaskReport
     from tacpipe.tasks.recordings import OpenedChain
     from tacpipe.tasks.touch.model import TouchModel
 
@@ -37,7 +38,7 @@ def demo(output: Path) -> Demo:
         ["evaluate", paths["pointnet"], paths["grasps"], *split, "-o", paths["pointnet-results"]],
     ]
     shortened = [f"{paths['touch']} (100 of 300 trees)", f"{paths['pointnet']} (4 of 250 epochs)"]
-    return Demo(commands, [paths["touch-results"], paths["pointnet-results"]], [paths["grasps"]], shortened=shortened)
+    return Demo(commands, [paths["touch-results"], paths["pointnet-results"]], shortened=shortened)
 
 
 REQUIREMENTS = Requirements(
@@ -90,9 +91,10 @@ class TouchTask(Task):
     """Predict the readings of grasps."""
 
     name = "touch"
+    requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=1, requirements=REQUIREMENTS)
+    @stage(version=1)
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts the tactile reading of a grasp.
 

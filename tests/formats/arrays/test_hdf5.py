@@ -10,7 +10,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import container
 from tacpipe.formats.table import layout
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
@@ -19,7 +19,7 @@ from tests.formats.builders import about, layout_params
 from tests.formats.table import labs
 
 NONE = Params()
-HDF5 = ContainerCommand("hdf5")
+HDF5 = LayoutCommand("hdf5")
 hdf5 = registry.load("ingest.hdf5")
 
 

@@ -14,7 +14,7 @@ from zarr import open_group
 import tacpipe
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import container
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import Lab
@@ -22,7 +22,7 @@ from tests.conftest import tacpipe as in_a_process
 from tests.formats.arrays import files
 
 LAYOUT = '[streams.hand]\nsource = "data"\ntime = { rate_hz = 60 }'
-ZARR = ContainerCommand("zarr")
+ZARR = LayoutCommand("zarr")
 zarr = registry.load("ingest.zarr")
 INGEST = "ingest zarr stores --layout layout.toml -o data/rec"
 

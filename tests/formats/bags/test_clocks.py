@@ -10,7 +10,7 @@ from tacpipe.channels import schema
 from tacpipe.formats.bags import topics
 from tacpipe.formats.bags.container import open_bag
 from tacpipe.formats.container import EpisodeContents
-from tacpipe.formats.table.contained import ContainerCommand, Params
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tacpipe.plugins import registry
 from tests.formats.bags import writers
 from tests.formats.bags.writers import START_NS, STEP_NS, Sent
@@ -23,7 +23,7 @@ ROW = np.arange(ROWS)
 T_NS = START_NS + ROW * STEP_NS
 LATENCY_NS = np.random.default_rng(4).integers(200_000, 3_000_000, ROWS)
 LOG_NS = T_NS + LATENCY_NS
-ROSBAG = ContainerCommand("rosbag")
+ROSBAG = LayoutCommand("rosbag")
 
 
 def wrenches(topic: str, header_ns: np.ndarray, log_ns: np.ndarray = LOG_NS, frame: str = "base") -> list[Sent]:

@@ -13,7 +13,7 @@ import pytest
 import tacpipe
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table.contained import ContainerCommand
+from tacpipe.formats.table.contained import LayoutCommand
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
@@ -23,7 +23,7 @@ from tests.formats.builders import about, layout_params
 from tests.formats.lerobot import files
 from tests.video import videos
 
-LEROBOT = ContainerCommand("lerobot")
+LEROBOT = LayoutCommand("lerobot")
 lerobot = registry.load("ingest.lerobot")
 EPISODE = "pick-episode_00000{}"
 

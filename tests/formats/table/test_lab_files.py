@@ -1,6 +1,8 @@
 """Arrays, workbooks, encodings and stamps as labs write them, compared with what numpy and pandas wrote."""
 
 import datetime
+import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.container import Time
-from tacpipe.formats.table import contained, guess, layout, recordings, stamps
+from tacpipe.formats.table import guess, layout, stamps
+from tacpipe.formats.table.contained import LayoutCommand, Params
 from tests.formats.table import labs
 
 SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
@@ -21,9 +24,9 @@ SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
 
 def streams_of(text: str, folder: Path) -> dict[str, pa.Table]:
     """Return the streams of the first recording below a folder, read with a layout."""
-    result = layout.parse_layout(text)
-    source = next(iter(contained.discover_sources(result, folder, recordings.find_recordings(result, folder)).values()))
-    output = contained.read_recording(result, None, source.files, source.values)
+    command, params = LayoutCommand(None), Params(layout=json.dumps(tomllib.loads(text)))
+    source = next(iter(command.discover(params, folder).values()))
+    output = command.read(params, source.files, source.values)
     return {name: table.read_all() for name, table in output.streams.items() if isinstance(table, pa.RecordBatchReader)}
 
 

@@ -3,27 +3,17 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.formats.table import preview
-from tacpipe.formats.table.preview import Steps
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 1000])
-def test_steps_that_are_counted_have_the_median_of_all(count: int) -> None:
-    values = np.random.default_rng(count).integers(0, 300, count)
-    result = Steps()
-    for part in np.array_split(values, 3):
-        result.add(part)
-    assert result.median_ns() == (np.median(values) if count else 0)
-    assert result.longer(100) == (values > 100).sum() and result.longest_ns() == values.max(initial=0)
-
-
-def test_steps_that_all_differ_are_counted_in_bounded_memory() -> None:
-    values = np.random.default_rng(0).normal(1e9, 1e7, 2 * preview.MAX_DIFFERENT).astype(np.int64)
-    result = Steps()
-    for part in np.array_split(values, 50):
-        result.add(part)
-    assert len(result._steps) <= preview.MAX_DIFFERENT
-    assert abs(result.median_ns() - np.median(values)) < 300
-    assert result.longest_ns() == values.max()
+def test_the_rate_gaps_and_longest_step_of_a_preview_are_those_of_all_steps(count: int) -> None:
+    steps_ns = np.random.default_rng(count).integers(0, 300, count)
+    t_ns = np.concatenate([[0], np.cumsum(steps_ns)])
+    table = pa.table({"t_ns": t_ns})
+    result = preview.summarize_stream(pa.RecordBatchReader.from_batches(table.schema, table.to_batches(7)))
+    median_ns = np.median(steps_ns) if count else 0
+    assert result.rate_hz == (1e9 / median_ns if median_ns else 0)
+    assert result.gaps == (steps_ns > 3 * median_ns).sum() and result.longest_s == steps_ns.max(initial=0) / 1e9
 
 
 def test_a_preview_of_batches_is_that_of_their_table() -> None:

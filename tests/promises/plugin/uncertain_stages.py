@@ -6,7 +6,7 @@ import json
 import os
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.plugins.stage import Result, stage
 
@@ -52,8 +52,8 @@ def fit(params: Nothing, train: Dataset) -> Result:
     return Result(files={"codec.json": os.urandom(4).hex().encode()})
 
 
-@stage(version=1, fit=fit)
-def fitted(params: Nothing, recording: Recording, codec: Fitted) -> pa.Table:
+@stage(version=1)
+def fitted(params: Nothing, recording: Recording, codec: Annotated[Fitted, fit]) -> pa.Table:
     """Return the table beside what the fit gave."""
     import pyarrow as pa
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.stage import Files, Result, stage
+from tacpipe.plugins.stage import Discovery, Files, Result, stage
 from tests.promises.trust import steps
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def discover(params: Nothing, source: Path) -> dict[str, dict[str, Path]]:
     return {path.stem: {path.name: path} for path in sorted(source.glob("*.txt"))}
 
 
-@stage(version=1, discover=discover)
+@stage(version=1, source=Discovery(discover))
 def load(params: Nothing, files: Files) -> pa.Table:
     """Turn a text into a table."""
     import pyarrow as pa

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics import headline
+from tacpipe.scores import headline
 from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import prediction as forward_prediction

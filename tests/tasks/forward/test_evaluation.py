@@ -32,7 +32,7 @@ from tests.tasks.forward.trials import (
 )
 
 OTHERS = {"known", "unseen", "counts", "skill", "situations", "context_mean"}
-LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
+LINEAR = {"train_mean", "autoregression", "plan_by_load", "ridge", "ridge_actions"}
 
 
 def held_object(seed: int, object_name: str | None) -> FakeShard:

@@ -19,8 +19,7 @@ from tacpipe.plugins.registry import load as load_stage
 from tacpipe.plugins.stage import Source
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.networks import Network
+from tacpipe.tasks.forward.forecaster import Forecaster, Network
 from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.conftest import sample_data
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
@@ -244,8 +243,8 @@ def publish(files: Mapping[str, Path]) -> FakeShard:
 @pytest.mark.skipif(not (sample_data() / "xela_flat_pick_move").is_dir(), reason="published recordings are not here")
 def test_raw_counts_of_published_trials_are_always_refused_and_counts_above_rest_never(tmp_path: Path) -> None:
     ingest = load_stage("ingest.xela-flat")
-    assert ingest.discover is not None
-    sources = list(ingest.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
+    assert ingest.source is not None
+    sources = list(ingest.source.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
     training, watched, *remaining = (publish(dict(files)) for files in sources if not isinstance(files, Source))
     asked_for = {"epochs": 1, "stride": 10, "baselines": False}  # trained on one trial, where the limit is least sure
     loaded = ForwardModel.load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))

@@ -13,6 +13,7 @@ from safetensors.numpy import load
 from tacpipe.errors import TacpipeError
 from tacpipe.io import spill
 from tacpipe.io.columns import Columns
+from tacpipe.models import linear
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.plugins.stage import Result
@@ -121,7 +122,8 @@ def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
         "val": {"recordings": 2, "windows": 2 * 72},  # validation and test have every window, whatever the stride
     }
     assert stored["params"] == to_json(params(stride=2, loss="absolute"))
-    assert set(stored["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
+    fitted = ("autoregression", "plan_by_load", "ridge", "ridge_actions")
+    assert set(stored["baselines"]) == {f"{name}.alpha" for name in fitted}
 
 
 def test_scales_are_those_of_numpy_over_the_training_rows(tmp_path: Path) -> None:
@@ -132,7 +134,10 @@ def test_scales_are_those_of_numpy_over_the_training_rows(tmp_path: Path) -> Non
     assert np.allclose(stored["feature_half"], np.ptp(values, axis=1) / 2, rtol=1e-5)
 
 
-def test_validation_recordings_change_neither_scales_nor_baselines_other_than_alpha(tmp_path: Path) -> None:
+def test_validation_recordings_change_neither_scales_nor_baselines_other_than_alpha_and_shrinkage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear, "ALPHAS", (10.0,))
     wild = FakeShard("wild", table(np.random.default_rng(0).normal(0, 1e4, (40, len(CHANNELS)))))
     tame, wide = (
         trained(tmp_path / str(len(part)), dataset(*TRAIN), dataset(*part), epochs=1) for part in (VAL, [*VAL, wild])
@@ -141,10 +146,8 @@ def test_validation_recordings_change_neither_scales_nor_baselines_other_than_al
     assert config(tame)["inputs"] == config(wide)["inputs"]
     first, second = load(tame["baselines.safetensors"]), load(wide["baselines.safetensors"])
     for name, values in first.items():
-        if not name.startswith("ridge"):
+        if not name.endswith("shrinkage"):
             assert np.array_equal(values, second[name]), name
-    for name in ("ridge.centre", "ridge.bias", "ridge_actions.centre", "ridge_actions.bias"):
-        assert np.array_equal(first[name], second[name]), name
     scales, wide_scales = load(tame["model.safetensors"]), load(wide["model.safetensors"])
     for name in scales:
         if name.endswith(("_scale", "_mean")):

@@ -12,10 +12,10 @@ import torch
 from safetensors.torch import load as load_tensors
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.metrics import headline
-from tacpipe.metrics.intervals import wilson
 from tacpipe.models.readout import StatisticsClassifier, View
 from tacpipe.plugins import given_params, registry
+from tacpipe.scores import headline
+from tacpipe.scores.intervals import wilson
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import model as material_prediction

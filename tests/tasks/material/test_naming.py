@@ -11,7 +11,7 @@ from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.headline import UNKNOWN, Naming
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.params import StoredNaming
-from tacpipe.tasks.material.report import figures, predictions
+from tacpipe.tasks.material.report import pictures, predictions
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
@@ -99,7 +99,7 @@ def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None
     assert tree["zero_shot"]["n"]["roboskin"] == 4
     table = result.recordings["predictions"].streams[""]
     read = predictions.read_predictions(table, MaterialModel.load(files).config)
-    assert {WORDS[number + 1] for number in read.of("roboskin").materials.tolist()} == {"felt", "foam, soft"}
+    assert set(read[read["sensor"] == "roboskin"]["material"]) == {"felt", "foam, soft"}
     with pytest.raises(UsageError, match=r"hold_out names roboskin=tin.*cork"):
         trained(tmp_path / "other", both[0], both[1], architecture="raec", hold_out="roboskin=tin")
 
@@ -110,7 +110,7 @@ def test_a_report_has_the_words(tmp_path: Path) -> None:
     shards = {"predictions": FakeShard("predictions", result.recordings["predictions"].streams[""])}
     given: Any = FakeDataset(shards, result.files, {})
     (method,) = parts.methods("material", given)
-    counts, names = figures.count_confusions(method, "biotac")
+    counts, names = pictures.count_confusions(method, "biotac")
     assert names == sorted(WORDS.values()) and counts.sum() == 3 * len(MATERIALS)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import calibration
 from tacpipe.models.minirocket import with_profile
 from tacpipe.models.readout import statistics
+from tacpipe.scores import calibration
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.model import MaterialModel

@@ -18,13 +18,15 @@ from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors import plan
+from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
+from tacpipe.tasks.learning.live.windows import StreamSoFar
 from tacpipe.tasks.slip import training
 from tacpipe.tasks.slip.calibration import EventScore
 from tacpipe.tasks.slip.labels import SlipLabels
 from tacpipe.tasks.slip.live import demo, evaluation
-from tacpipe.tasks.slip.live.engine import FingerSoFar, SlipEngine
+from tacpipe.tasks.slip.live.engine import SlipEngine
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tacpipe.tasks.slip.live.task import SlipLive, SlipSettings
@@ -74,7 +76,7 @@ class Rig:
         self.packets, streams = {}, {}
         for number, (name, sensor) in enumerate(self.sensors.items()):
             samples = made.samples("xela", sensor, ROWS, number + 1)
-            self.packets[name] = made.pieces(sensor, sensor.encode(samples))
+            self.packets[name] = split_frames(sensor, sensor.encode(samples))
             t_ns = np.array([self.at_ns(name, row) + OFFSET_NS for row in range(ROWS)])
             values = np.hstack(samples.values)
             schema = pa.schema([pa.field("t_ns", pa.int64()), *sensor.fields()])
@@ -120,6 +122,11 @@ def engine_for(rig: Rig, model: SlipModel, level: float = 0.0) -> SlipEngine:
     return engine
 
 
+def answered(engine: SlipEngine, now_ns: int) -> list[SlipMessage]:
+    """Return the messages that are due."""
+    return [message for message in engine.step(now_ns) if isinstance(message, SlipMessage)]
+
+
 def published(rig: Rig, engine: SlipEngine, rows: int = ROWS, size: int = 1) -> list[SlipMessage]:
     """Return the messages of a session whose samples arrive ``size`` at a time."""
     messages: list[SlipMessage] = []
@@ -129,7 +136,7 @@ def published(rig: Rig, engine: SlipEngine, rows: int = ROWS, size: int = 1) -> 
             engine.take(name, Chunks.from_pairs([(rig.at_ns(name, row), rig.packets[name][row]) for row in chosen]))
         if "plan" in engine.sensors and (pairs := [rig.plans[row] for row in chosen if row in rig.plans]):
             engine.take("plan", Chunks.from_pairs(pairs))
-        messages += engine.step(rig.at_ns("right", min(first + size, rows) - 1) + SETTLE_NS)
+        messages += answered(engine, rig.at_ns("right", min(first + size, rows) - 1) + SETTLE_NS)
     return messages
 
 
@@ -208,7 +215,7 @@ def test_a_process_that_replaces_another_takes_its_levels_at_rest(rig: Rig, mode
         engine.take(name, StreamNote(START_NS, name, BEGAN))
         pairs = [(rig.at_ns(name, row), rig.packets[name][row]) for row in range(60, 100)]
         engine.take(name, Chunks.from_pairs(pairs))
-    messages = [message for message in engine.step(rig.at_ns("right", 99) + SETTLE_NS) if message.answers]
+    messages = [message for message in answered(engine, rig.at_ns("right", 99) + SETTLE_NS) if message.answers]
     expected = {row["t_ns"]: row["score"] for row in model.table(rig.recording).to_pylist()}
     assert messages
     assert all(message.score == expected[message.t_ns] for message in messages)
@@ -222,11 +229,11 @@ def test_rows_are_the_same_however_a_stream_is_cut(sizes: list[int], seed: int) 
     raw = rng.normal(100, 10, (count, 3))
     raw[rng.random(raw.shape) < 0.1] = np.nan
     t_ns = np.arange(count, dtype=np.int64) * PERIOD_NS
-    from tacpipe.tasks.slip.windows import Finger, RawFinger
+    from tacpipe.tasks.learning.inputs import InputStream, RawStream
 
-    finger = Finger("left", ("a", "b", "c"), ({}, {}, {}), 5, 50.0, np.array([2.0, 3.0, 4.0]))
-    whole = RawFinger(t_ns, raw).above_rest(finger, 100_000_000)
-    so_far = FingerSoFar(finger, 100_000_000)
+    finger = InputStream("left", ("a", "b", "c"), ({}, {}, {}), 5, 50.0, np.array([2.0, 3.0, 4.0]))
+    whole = RawStream(t_ns, raw).above_rest(finger, 100_000_000)
+    so_far = StreamSoFar(finger, 100_000_000)
     for first, size in zip(np.cumsum([0, *sizes[:-1]]), sizes, strict=True):
         so_far.add(t_ns[first : first + size], raw[first : first + size])
     if so_far.rest is not None:

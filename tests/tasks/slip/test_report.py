@@ -9,6 +9,7 @@ import pytest
 
 from tacpipe.comparison.runs import Method
 from tacpipe.tasks.slip import evaluation, training
+from tacpipe.tasks.slip.metrics import QUESTIONS
 from tacpipe.tasks.slip.params import Boosting
 from tacpipe.tasks.slip.report import ALARM_HEADS, SlipReport, alarm_table, area_table, pooled_metrics
 from tests.fake_recordings import FakeDataset, dataset
@@ -29,16 +30,17 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     ]
 
 
-def test_runs_have_the_brier_score_of_each_predictor_and_the_control_is_marked(results: list[Any]) -> None:
+def test_runs_have_the_areas_of_the_metrics_and_the_control_is_marked(results: list[Any]) -> None:
     without_windows: Any = FakeDataset()
     runs = SlipReport("slip").read([*results, without_windows])
     assert [run.control for run in runs] == [False, False, True]
     assert [run.simulated for run in runs] == [False, True, False]
-    (errors,) = runs[0].questions.values()
+    assert [question.target for question in runs[0].questions] == [*QUESTIONS.values()]
+    errors = next(iter(runs[0].questions.values()))
     metrics = json.loads(results[0].files["metrics.json"])
     for predictor in ("model", "time_only", "constant"):
         score = errors.measure.score_of(errors.sums[predictor].values())
-        assert score == pytest.approx(metrics[predictor]["brier"], abs=1e-5)
+        assert score == pytest.approx(metrics[predictor]["auc"]["before"]["value"], abs=1e-5)
 
 
 def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[Any]) -> None:
@@ -48,7 +50,7 @@ def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[An
     assert pooled["counts"]["slips"] == 6
     areas = area_table(pooled)
     assert list(areas.heads) == [
-        *("windows", "model", "linear", "shear over load", "time only", "total change", "constant")
+        *("windows", "model", "best feature", "linear", "shear over load", "time only", "total change", "constant")
     ]
     alarms = alarm_table(pooled)
     assert len(alarms.rows) == 3
@@ -56,7 +58,7 @@ def test_the_metrics_of_folds_are_those_of_all_their_recordings(results: list[An
 
 
 def test_a_recording_that_two_folds_test_counts_where_its_object_is_new(results: list[Any]) -> None:
-    evaluated = evaluation.EvaluatedSlips.from_result(results[0])
+    evaluated = dataclasses.replace(evaluation.EvaluatedSlips.from_result(results[0]), known_objects=frozenset())
     objects = frozenset(track.object for track in evaluated.tracks)
     trained = dataclasses.replace(
         evaluated, known_objects=objects, levels={track.name: {} for track in evaluated.tracks}

@@ -37,6 +37,11 @@ def test_a_model_finds_slips_of_unseen_recordings_before_they_begin(files: dict[
     assert metrics["time_only"]["auc"]["before"]["value"] < 0.7
     assert metrics["model"]["brier"] < metrics["constant"]["brier"]
     assert metrics["constant"]["auc"]["before"]["value"] == 0.5
+    assert metrics["time_only"]["auc"]["before"]["value"] < metrics["best_feature"]["auc"]["before"]["value"]
+    (column,) = json.loads(files["config.json"])["baselines"]["best_feature"]["columns"]
+    assert result.notes == [
+        f"The baseline best feature is {SlipModel.load(files).reader.names[column]}, larger before slips."
+    ]
 
 
 def test_a_model_of_shuffled_labels_finds_no_slip(tmp_path: Path) -> None:
@@ -85,7 +90,7 @@ def test_a_single_window_scores_as_among_others(files: dict[str, bytes]) -> None
     scores = model.scorer.score(model.reader, track, rows)
     for row, score in list(zip(rows, scores, strict=True))[::17]:
         windows = [
-            track.windows(np.array([row]), place, finger.rows)[0] for place, finger in enumerate(model.reader.fingers)
+            track.windows(np.array([row]), place, finger.rows)[0] for place, finger in enumerate(model.reader.streams)
         ]
         assert model.scorer.score_window(model.reader, windows) == score
 
@@ -169,7 +174,7 @@ def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path)
     model = SlipModel.load(files)
     track = model.reader.track(recording)  # type: ignore[arg-type]
     assert (
-        model.scorer.score_window(model.reader, [track.fingers[0].values[:1]])
+        model.scorer.score_window(model.reader, [track.streams[0].values[:1]])
         == model.table(recording)["score"][0].as_py()
     )
 

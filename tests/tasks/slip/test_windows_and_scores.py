@@ -14,13 +14,15 @@ from sklearn.metrics import roc_auc_score
 from sklearn.preprocessing import StandardScaler
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.slip import calibration, metrics
-from tacpipe.tasks.slip.boosting import BoostedTrees
+from tacpipe.models.boosting import BoostedTrees, TreeSizes
+from tacpipe.scores import pairing
+from tacpipe.scores.pairing import Sums
+from tacpipe.tasks.learning.features import ChannelAxes, stream_features
+from tacpipe.tasks.slip import calibration, evaluation, metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
-from tacpipe.tasks.slip.features import FingerLayout, finger_features
 from tacpipe.tasks.slip.labels import read_labels
 from tacpipe.tasks.slip.params import Boosting
-from tacpipe.tasks.slip.scorers import LinearScorer
+from tacpipe.tasks.slip.scorers import LinearScorer, best_column
 from tacpipe.tasks.slip.windows import (
     BEFORE,
     DURING,
@@ -34,8 +36,8 @@ from tacpipe.tasks.slip.windows import (
 from tests.fake_recordings import FakeRecording, dataset
 from tests.tasks.slip.slip_recordings import held_object, trials
 
-AXES = FingerLayout.from_layout([{"axis": axis} for axis in "xyzxyz"])
-PLAIN = FingerLayout.from_layout([{}, {}, {}, {}, {}, {}])
+AXES = ChannelAxes.from_layout([{"axis": axis} for axis in "xyzxyz"])
+PLAIN = ChannelAxes.from_layout([{}, {}, {}, {}, {}, {}])
 
 
 @settings(max_examples=50, deadline=None)
@@ -43,9 +45,9 @@ PLAIN = FingerLayout.from_layout([{}, {}, {}, {}, {}, {}])
     arrays(np.float64, st.tuples(st.integers(2, 9), st.integers(1, 30), st.just(6)), elements=st.floats(-1e3, 1e3)),
     st.sampled_from([AXES, PLAIN]),
 )
-def test_a_window_has_the_same_features_by_itself_as_among_others(windows: np.ndarray, layout: FingerLayout) -> None:
-    together = finger_features(windows, layout)
-    by_itself = np.concatenate([finger_features(window[None].copy(), layout) for window in windows])
+def test_a_window_has_the_same_features_by_itself_as_among_others(windows: np.ndarray, layout: ChannelAxes) -> None:
+    together = stream_features(windows, layout)
+    by_itself = np.concatenate([stream_features(window[None].copy(), layout) for window in windows])
     assert together.tobytes() == by_itself.tobytes()
 
 
@@ -54,9 +56,9 @@ def test_shear_over_load_is_that_of_the_means_of_taxels() -> None:
     window[0, :, [0, 3]] = 3.0  # x of both taxels
     window[0, :, [1, 4]] = 4.0  # y
     window[0, :, [2, 5]] = -10.0  # z
-    from tacpipe.tasks.slip.features import NAMES
+    from tacpipe.tasks.learning.features import NAMES
 
-    features = dict(zip(NAMES, finger_features(window, AXES)[0], strict=True))
+    features = dict(zip(NAMES, stream_features(window, AXES)[0], strict=True))
     assert features["shear over load"] == pytest.approx(0.5)
     assert features["spread of ratios"] == pytest.approx(0.0)
     assert features["speed"] == 0.0
@@ -73,7 +75,7 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
     sizes = {"learning_rate": 0.2, "max_leaf_nodes": 8, "min_samples_leaf": 5, "l2_regularization": 1.0}
     oracle = HistGradientBoostingClassifier(max_iter=20, early_stopping=False, random_state=3, **sizes)
     oracle.fit(rows, labels, sample_weight=weights)
-    trees = BoostedTrees.fit(rows, labels, weights, trees=20, leaves=8, leaf=5, learning_rate=0.2, l2=1.0, seed=3)
+    trees = BoostedTrees.fit(rows, labels, weights, TreeSizes(20, 8, 5, 0.2, 1.0, 3))
     assert trees.scores(rows) == pytest.approx(oracle.decision_function(rows), abs=1e-9)
     loaded = BoostedTrees.from_arrays(trees.arrays(), 5)
     assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
@@ -96,11 +98,32 @@ def test_the_linear_baseline_scores_as_the_regression_of_scikit_learn_does() -> 
         LinearScorer.load({**scorer.arrays(), "weights": np.zeros(2)}, scorer.describe(), reader)
 
 
+def test_the_best_feature_has_the_largest_area_of_all_in_either_direction() -> None:
+    reader, tracks = read_training(dataset(*trials(8)), Boosting())
+    windows = read_windows(reader, tracks, Boosting(), stride=5)
+
+    def area(values: np.ndarray) -> float:
+        return float(roc_auc_score(windows.slips, np.nan_to_num(values), sample_weight=windows.weights))
+
+    best = max(abs(area(column) - 0.5) for column in windows.features[:, :-1].T)
+    scores = LinearScorer.fit(windows, [best_column(windows)]).score_features(windows.features)
+    assert area(scores) == pytest.approx(0.5 + best, abs=1e-9)
+    opposite = dataclasses.replace(windows, features=-windows.features)
+    assert best_column(opposite) == best_column(windows)
+    opposite_scores = LinearScorer.fit(opposite, [best_column(opposite)]).score_features(opposite.features)
+    assert area(opposite_scores) == pytest.approx(0.5 + best, abs=1e-9)
+
+
+def test_the_best_feature_is_never_the_time() -> None:
+    reader, tracks = read_training(dataset(*trials(8)), Boosting())
+    windows = read_windows(reader, tracks, Boosting(), stride=5)
+    windows.features[:, -1] = windows.slips
+    assert best_column(windows) < reader.feature_count
+
+
 def test_trees_whose_nodes_lead_back_are_refused() -> None:
     rows = np.random.default_rng(0).normal(size=(100, 2))
-    trees = BoostedTrees.fit(
-        rows, rows[:, 0] > 0, np.ones(100), trees=2, leaves=4, leaf=5, learning_rate=0.2, l2=1.0, seed=0
-    )
+    trees = BoostedTrees.fit(rows, rows[:, 0] > 0, np.ones(100), TreeSizes(2, 4, 5, 0.2, 1.0, 0))
     arrays_by_name = trees.arrays()
     arrays_by_name["children"] = np.where(arrays_by_name["children"] > 0, 0, arrays_by_name["children"])
     with pytest.raises(ValueError, match="children"):
@@ -118,12 +141,41 @@ def test_the_area_under_the_curve_is_that_of_scikit_learn_for_any_draw_of_object
         track = scored(rng.integers(0, 6, 30).astype(float), states)
         tracks.append(dataclasses.replace(track, name=name, object=name, weights=rng.random(30) + 0.1))
     windows = metrics.WindowScores(tracks)
-    draws = np.array([[1.0, 1.0, 1.0], [2.0, 0.0, 1.0]])
+    layout, rows = sums_of(windows)
+    chosen = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
     expected = [
         roc_auc_score(windows.states > 0, windows.scores, sample_weight=windows.weights * draw[windows.objects])
-        for draw in draws
+        for draw in chosen
     ]
-    assert windows.area("before").selected(draws) == pytest.approx(expected)
+    assert layout.area(chosen @ np.stack(list(rows.values()))) == pytest.approx(expected)
+
+
+def sums_of(windows: metrics.WindowScores, part: str = "before") -> tuple[metrics.AreaLayout, Sums]:
+    """Return the sums of recordings for the area of a part, and their layout."""
+    layout = metrics.AreaLayout(track.object for track in windows.tracks)
+    return layout, windows.sums(part, layout, np.zeros(len(windows.scores)))
+
+
+def estimate_of(windows: metrics.WindowScores) -> metrics.ObjectEstimate:
+    """Return the area under the curve of windows before slips."""
+    layout, rows = sums_of(windows)
+    return metrics.areas({"before": rows}, layout.measure(), {track.name: track.object for track in windows.tracks})[
+        "before"
+    ]
+
+
+def test_scores_of_different_folds_are_not_compared() -> None:
+    states = np.repeat([BEFORE, STABLE], 5)
+    perfect = {fold: scored(np.where(states == BEFORE, 1.0, 0.0) + 10 * fold, states) for fold in (0, 1)}
+    tracks = tuple(dataclasses.replace(track, name=f"r{fold}", object=f"o{fold}") for fold, track in perfect.items())
+    scores = {evaluation.MODEL: tuple(track.scores for track in tracks)}
+    layout = metrics.AreaLayout(["o0", "o1"])
+    areas = []
+    for folds in ((0, 0), (0, 1)):
+        evaluated = evaluation.EvaluatedSlips(tracks, scores, {**scores}, {}, folds=folds)
+        rows = evaluated.sums(layout, ("before",))[evaluation.MODEL]["before"]
+        areas.append(float(layout.area(np.sum(list(rows.values()), axis=0)[None])[0]))
+    assert areas == [0.75, 1.0]  # the second fold's scores are higher throughout
 
 
 def objects_with_slips(count: int, seed: int = 0) -> metrics.WindowScores:
@@ -145,23 +197,24 @@ def test_the_interval_of_an_area_is_students_over_areas_without_one_object_each(
         return float(roc_auc_score(windows.states[rest] > 0, windows.scores[rest]))
 
     areas, others = (np.array([without(part, number) for number in range(9)]) for part in (windows, other))
-    odds, value = np.log(areas / (1 - areas)), windows.area("before").value
+    value = float(roc_auc_score(windows.states > 0, windows.scores))
+    odds = np.log(areas / (1 - areas))
     width = scipy.stats.t.ppf(0.975, 8) * np.sqrt(8 / 9 * np.square(odds - odds.mean()).sum())
     ends = [1 / (1 + np.exp(-(np.log(value / (1 - value)) + sign * width))) for sign in (-1, 1)]
-    estimate = metrics.areas(windows)["before"]
+    estimate = estimate_of(windows)
     assert [estimate["value"], estimate["low"], estimate["high"]] == pytest.approx([value, *ends], rel=1e-5)
     difference = areas - others
     width = scipy.stats.t.ppf(0.975, 8) * np.sqrt(8 / 9 * np.square(difference - difference.mean()).sum())
-    margin = metrics.margin(windows, other)
-    assert margin["value"] is not None and margin["high"] is not None
-    assert margin["high"] - margin["value"] == pytest.approx(width, rel=1e-4)
+    (layout, rows), (_, other_rows) = sums_of(windows), sums_of(other)
+    margin = pairing.difference(layout.measure(), rows, other_rows)
+    assert margin.high - margin.mean == pytest.approx(width, rel=1e-4)
 
 
 def test_values_that_no_object_changes_and_those_of_two_objects_have_no_interval() -> None:
     windows = objects_with_slips(9)
     windows.scores[:] = 0.0
-    assert metrics.areas(windows)["before"] == {"value": 0.5, "low": None, "high": None}
-    assert metrics.areas(objects_with_slips(2))["before"]["low"] is None
+    assert estimate_of(windows) == {"value": 0.5, "low": None, "high": None}
+    assert estimate_of(objects_with_slips(2))["low"] is None
     no_slip = metrics.ratio_estimate(np.zeros(0, bool), np.zeros(0, np.intp), 3)
     assert no_slip == {"value": None, "low": None, "high": None}
 
@@ -246,7 +299,7 @@ def test_shuffled_labels_keep_the_number_of_slips_and_their_times() -> None:
 def test_a_recording_of_other_channels_is_refused() -> None:
     recording = held_object(2, None)
     fewer = {**recording.tables, "right": recording.tables["right"].drop_columns(["taxel01_x"])}
-    with pytest.raises(TacpipeError, match="other tactile channels"):
+    with pytest.raises(TacpipeError, match="other input channels"):
         read_training(dataset(held_object(1, None), dataclasses.replace(recording, tables=fewer)), Boosting())
 
 

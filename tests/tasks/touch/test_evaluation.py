@@ -15,8 +15,8 @@ from sklearn.metrics import mean_absolute_error, r2_score, root_mean_squared_err
 
 from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import regression
 from tacpipe.plugins.stage import Result
+from tacpipe.scores import regression
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
 

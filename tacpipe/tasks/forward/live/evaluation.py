@@ -21,12 +21,12 @@ from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.stages import RecordingsInMemory, extracted_streams, run_stages, streams_as_recorded
-from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
+from tacpipe.scores import headline
 from tacpipe.tasks.forward import evaluation
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.headline import ForwardMetrics, LiveMetrics
+from tacpipe.tasks.forward.headline import LiveMetrics
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
@@ -68,12 +68,12 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
         **summed(list(sessions.values()), steps, channels),
         "recordings": {name: summed([session], steps, channels) for name, session in sessions.items()},
     }
-    offline_metrics = ForwardMetrics.from_json(json.loads(result.files["metrics.json"]))
+    offline_metrics = json.loads(result.files["metrics.json"])
     headlines_offline = headline.read(result.files[headline.FILE])
     added = _headline(forecaster, sessions, steps, channels)
     files = {
         **result.files,
-        "metrics.json": model_files.to_json(dataclasses.replace(offline_metrics, live=live).to_json()),
+        "metrics.json": model_files.to_json({**offline_metrics, "live": live}),
         "live.csv": measures.table(live, steps),
         headline.FILE: headline.write([*headlines_offline, *added]),
     }

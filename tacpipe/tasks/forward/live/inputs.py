@@ -140,7 +140,7 @@ class InputLayout:
         joints = (place_columns(angles), place_columns(speeds)) if has_joints else (None, None)
         finger = place_columns([opening] if opening else [])
         readings = {
-            stream: _stream_columns(signals[stream], names, synchronize, is_master=stream == leader)
+            stream: StreamColumns.from_schema(signals[stream], names, synchronize, is_master=stream == leader)
             for stream, names in columns.items()
         }
         return cls(
@@ -229,27 +229,6 @@ class InputLayout:
             values = stacked[:, channels].astype(self.kinds[stream])
             levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
         return levels
-
-
-def _stream_columns(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> StreamColumns:
-    """Return the columns that are read of a stream. If its repeated samples matter, add all its channels to ``names``."""
-    import pyarrow as pa
-
-    compared: list[int] = []
-    if is_master and synchronize.grid == "fresh":
-        compared_names = [name for name in streams.channel_names(schema) if streams.method(schema, name) != "nearest"]
-        names += [name for name in compared_names if name not in names]
-        compared = [names.index(name) for name in compared_names]
-    wraps = [
-        index
-        for index, name in enumerate(names)
-        if synchronize.unwrap
-        and (schema.field(name).metadata or {}).get(b"quantity") == b"tactile"
-        and pa.types.is_integer(schema.field(name).type)
-        and schema.field(name).type.bit_width == 16
-    ]
-    medians = [index for index, name in enumerate(names) if streams.method(schema, name) == "median"]
-    return StreamColumns(len(names), wraps, medians, compared)
 
 
 def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Schema) -> None:

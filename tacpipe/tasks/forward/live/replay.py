@@ -11,19 +11,16 @@ import numpy as np
 from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
-from tacpipe.live.stages import extracted_streams, streams_as_recorded
+from tacpipe.live.stages import arrival_streams, extracted_streams, pieces_by_arrival, streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.store.records import Step
-from tacpipe.synchronization.placement import are_arrivals
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, GridForecast, LiveChain
 from tacpipe.tasks.forward.prediction import check_steps, prediction_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-PIECE_NS = 1_000_000_000  # duration of the chunks of a recording that a chain gets
 
 
 def predict(
@@ -120,11 +117,6 @@ def build_chain(
     `LiveChain.for_model`.
     """
     schemas = {name: table.schema for name, table in tables.items()}
-    arrivals = [
-        name
-        for name, table in tables.items()
-        if table.num_rows and are_arrivals(table.schema.field("t_ns"), recording.attributes, equal_fraction(table))
-    ]
     plan = str(recording.attributes.get("live_plan", ""))
     stream = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     return LiveChain.for_model(
@@ -135,13 +127,8 @@ def build_chain(
         plan_from=stream if stream in schemas else "",
         quantiles=quantiles,
         allow_look_ahead=allow_look_ahead,
-        arrivals=arrivals,
+        arrivals=arrival_streams(recording, tables),
     )
-
-
-def equal_fraction(table: pa.Table) -> float:
-    """Return the fraction of stamps of a stream that equal the previous one."""
-    return float((np.diff(table.column("t_ns").to_numpy()) == 0).sum() / table.num_rows)
 
 
 def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Iterator[GridForecast]:
@@ -149,20 +136,10 @@ def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Itera
 
     Samples are passed to ``chain`` in chunks, in the order of arrival.
     """
-    stamps = {
-        name: tables[name].column("t_ns").to_numpy()
-        for name in (*chain.streams, PLAN)
-        if name in tables and tables[name].num_rows
-    }
-    if chain.master not in stamps:
-        return
-    begins, last = min(int(stream_ns[0]) for stream_ns in stamps.values()), int(stamps[chain.master][-1])
-    rows = dict.fromkeys(stamps, 0)
-    for until_ns in (*range(begins, last, PIECE_NS), last):
-        for name, t_ns in stamps.items():
-            stop = int(np.searchsorted(t_ns, until_ns, side="right"))
-            chain.push(name, tables[name].slice(rows[name], stop - rows[name]))
-            rows[name] = stop
+    read = {name: tables[name] for name in (*chain.streams, PLAN) if name in tables}
+    for until_ns, pieces in pieces_by_arrival(read, chain.master):
+        for name, piece in pieces.items():
+            chain.push(name, piece)
         yield from chain.advance(until_ns)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import PositiveInt
@@ -14,6 +15,7 @@ from tacpipe.plugins.stage import Attribute, Result
 from tacpipe.sensors.live import Declaration
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.sensors.sensor import Options, Sensor
+from tacpipe.tasks import task
 from tacpipe.tasks.forward.live.messages import DECLARATION, FORECAST
 
 if TYPE_CHECKING:
@@ -51,9 +53,7 @@ class ForwardLive(LiveTask):
 
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of forecasts and latencies, and the rig with a stream of plans if needed."""
-        from tacpipe.datasets import model_files
         from tacpipe.live import plans
-        from tacpipe.tasks import task
         from tacpipe.tasks.forward.live.stages import refuse_look_ahead
 
         config: ForwardConfig = model_files.tree(

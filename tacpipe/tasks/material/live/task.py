@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
@@ -43,8 +44,6 @@ class MaterialLive(LiveTask):
 
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of materials and latencies, and the settings that `predict` needs as attributes."""
-        from tacpipe.datasets import model_files
-
         own_settings = _material_settings(settings)
         config = model_files.tree(model.files, model_files.CONFIG, {"classes": list})
         names = config.get("names") or {number: number for number in config["classes"]}

@@ -2,42 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
+import pandas as pd
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings, marks
+from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
-from tacpipe.tasks.material.headline import MaterialMetrics
+from tacpipe.tasks.material.headline import MaterialMetrics, sensor_title
 from tacpipe.tasks.material.params import MaterialConfig, kind_of
 from tacpipe.tasks.material.report import predictions
-from tacpipe.tasks.material.report.predictions import (
-    LAST,
-    LEVEL,
-    LEVEL_ONLY,
-    LEVEL_REMOVED,
-    MODEL,
-    NOTHING,
-    SHUFFLED,
-    SWAPPED,
-    SlidePredictions,
-)
 
-SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that names do not mark
-_PLAIN = {
+_COMPETING = {  # settings of methods that compete: trained on all materials and slides, with true labels and pairs
     "pairing": ("random", "fixed"),
     "labels": ("true",),
     "subsample_sensor": ("",),
     "hold_out": ("",),
     "few": ("",),
-    "elsewhere": (False,),
 }
 # Runs of one method may differ in these; run_label and quantities are shown as split and vibration.
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
@@ -58,33 +46,19 @@ class MaterialResult(context.ReportResult[MaterialConfig]):
         return metrics
 
     @cached_property
-    def predictions(self) -> SlidePredictions:
-        """Predictions for each unseen slide."""
+    def predictions(self) -> pd.DataFrame:
+        """Predictions for each unseen slide, as `predictions.read_predictions` returns them."""
         return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:
         """Sensors whose slides the model was evaluated on."""
-        return ordered_sensors(self.predictions.sensors.tolist())
+        return tuple(sorted(set(self.predictions["sensor"])))
 
     @property
     def trained(self) -> Mapping[str, int]:
         """Number of slides with the role train, by sensor."""
         return self.config.get("counts", {}).get("train", {})
-
-    @property
-    def learned(self) -> Mapping[str, int]:
-        """Number of slides that the model learns from, by sensor. Readouts may also learn from validation slides."""
-        params, counts = self.params, dict(self.trained)
-        is_readout = kind_of(self.architecture).IS_READOUT
-        if is_readout and params.get("use_validation") and params.get("labels") != "permuted":
-            validation_counts = self.config["counts"].get("val", {})
-            return {sensor: count + validation_counts.get(sensor, 0) for sensor, count in counts.items()}
-        reduced_sensor = params.get("subsample_sensor")
-        if reduced_sensor in counts:
-            batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
-            counts[reduced_sensor] = slides_kept(counts[reduced_sensor], batch, percent)
-        return counts
 
     @property
     def architecture(self) -> str:
@@ -126,69 +100,14 @@ def settings(results: Sequence[MaterialResult]) -> list[Settings]:
     ]
 
 
-def has_usual_settings(settings: Settings, *but: str) -> bool:
-    """Return whether a method was trained on all materials and slides, with true labels and pairs, as tables require.
-
-    The settings in ``but`` may differ.
-    """
-    return all(name in but or settings[name] in allowed for name, allowed in _PLAIN.items())
-
-
-def method_title(method: Method) -> str:
-    """Return a method's name without the number of slides, for a curve over that number."""
-    settings = method.settings
-    parts = [base_name({**settings, "few": "", "subsample_sensor": ""})]
-    parts += [mark for mark in marks(method.differing) if not mark.endswith("shuffle")]
-    if settings["joint"] and (settings["few_of"] or settings["subsample_sensor"]):
-        parts.append("other sensor whole")
-    if not settings.get("shuffle", True):
-        parts.append("fixed batches")
-    return " · ".join(parts)
-
-
 def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
     """Return the sensors that any of the methods was evaluated on."""
-    return ordered_sensors([sensor for method in methods for result in method.details for sensor in result.sensors])
+    return tuple(sorted({sensor for method in methods for result in method.details for sensor in result.sensors}))
 
 
 def runs_on(method: Method, sensor: str) -> list[ComparedRun]:
     """Return the runs of a method that were evaluated on slides of ``sensor``."""
     return [run for run in method.runs if sensor in run.details.sensors]
-
-
-def ordered_sensors(sensors: Collection[str]) -> tuple[str, ...]:
-    """Return the unique sensors in table order: those of the paper first."""
-    named_sensors = list(SENSORS)
-    return tuple(
-        sorted(
-            set(sensors),
-            key=lambda sensor: (named_sensors.index(sensor) if sensor in named_sensors else len(named_sensors), sensor),
-        )
-    )
-
-
-def sensor_title(sensor: str) -> str:
-    """Return the display name of a sensor.
-
-    >>> sensor_title("biotac"), sensor_title("xela1")
-    ('BioTac', 'xela1')
-    """
-    return SENSORS.get(sensor, sensor)
-
-
-def slides_kept(slides: int, batch: int, ratio: int) -> int:
-    """Return the number of training slides of a sensor that keeps ``ratio`` % of the full batches.
-
-    90 % skips each tenth batch; the others keep each second, fourth, sixth and ninth.
-
-    >>> [slides_kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
-    [600, 512, 288, 160, 96, 64]
-    """
-    steps = {50: 2, 25: 4, 17: 6, 11: 9}
-    batches = range(slides // batch)
-    if ratio == 100:
-        return slides
-    return batch * sum(number % 10 != 0 if ratio == 90 else number % steps[ratio] == 0 for number in batches)
 
 
 def base_name(settings: Settings, variants: bool = True) -> str:
@@ -248,14 +167,13 @@ def _settings(run: MaterialResult) -> Settings:
 
 
 def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], known_fractions: list[float]) -> dict[str, str]:
-    """Return how many training slides a run used if fewer than all (``few``), and which sensors, if not all (``few_of``).
+    """Return how many training slides a run used if fewer than all (``few``), of which sensors if not of all.
 
     A number is that of an earlier run with about as many slides, if there is one; ``known_fractions`` collects the
-    fractions of the other runs. A sensor that learns from only some batches counts as having all slides, because that
-    is a separate setting.
+    fractions of the other runs.
     """
     fewer = {}
-    for sensor in ordered_sensors(run.trained):
+    for sensor in sorted(run.trained):
         fraction = run.trained[sensor] / max(all_slides[sensor], 1)
         if fraction > _SAME:
             continue
@@ -264,26 +182,22 @@ def _reduced_counts(run: MaterialResult, all_slides: Mapping[str, int], known_fr
             known_fractions.append(fraction)
         fewer[sensor] = str(round((similar or [fraction])[0] * all_slides[sensor]))
     if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
-        return {"few": next(iter(fewer.values())), "few_of": ""}
-    reductions = ", ".join(f"{sensor_title(sensor)} {count}" for sensor, count in fewer.items())
-    return {"few": reductions, "few_of": ",".join(fewer)}
+        return {"few": next(iter(fewer.values()))}
+    return {"few": ", ".join(f"{sensor_title(sensor)} {count}" for sensor, count in fewer.items())}
 
 
 PREDICTOR_NAMES = {
-    LEVEL: headline.BASELINES[LEVEL],
-    LEVEL_ONLY: headline.BASELINES[LEVEL_ONLY],
-    LEVEL_REMOVED: "same readout, level removed",
-    SHUFFLED: "trained on shuffled labels",
-    SWAPPED: "classifiers exchanged",
-    LAST: "last epoch",
+    predictions.LEVEL: headline.BASELINES[predictions.LEVEL],
+    predictions.LEVEL_ONLY: headline.BASELINES[predictions.LEVEL_ONLY],
+    predictions.LEVEL_REMOVED: "same readout, level removed",
+    predictions.SHUFFLED: "trained on shuffled labels",
+    predictions.SWAPPED: "classifiers exchanged",
+    predictions.LAST: "last epoch",
 }
 KINDS: dict[str, Kind] = {
-    MODEL: "model",
-    LEVEL: "baseline",
-    LEVEL_ONLY: "baseline",
-    headline.CHANCE: "baseline",
-    SHUFFLED: "control",
-    LEVEL_REMOVED: "control",
+    predictions.MODEL: "model",
+    **dict.fromkeys((predictions.LEVEL, predictions.LEVEL_ONLY, headline.CHANCE), "baseline"),
+    **dict.fromkeys((predictions.SHUFFLED, predictions.LEVEL_REMOVED), "control"),
 }
 
 
@@ -301,9 +215,10 @@ def question_on(run: ComparedRun, sensor: str) -> Question | None:
 
 def correct_by_recording(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
     """Return (correct, 1) for each slide of a sensor by recording, where correct is 1 or 0."""
-    rows = result.predictions.of(sensor)
-    triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
-    return {str(name): np.array([answer == truth, 1.0]) for name, answer, truth in triples if answer != NOTHING}
+    rows = result.predictions
+    rows = rows[(rows["sensor"] == sensor) & rows[predictor].notna()]
+    right = (rows[predictor] == rows["material"]).to_numpy(float)
+    return dict(zip(rows["recording"], np.column_stack([right, np.ones(len(rows))]), strict=True))
 
 
 def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
@@ -312,11 +227,10 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
     classes = len(result.config.get("classes", ()))
     questions = {}
     for sensor in result.sensors:
-        sums = {
-            predictor: correct_by_recording(result, sensor, predictor) for predictor in result.predictions.predicted
-        }
+        predictors = [name for name in predictions.PREDICTORS if name in result.predictions]
+        sums = {name: correct_by_recording(result, sensor, name) for name in predictors}
         if classes:
-            sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
+            sums[headline.CHANCE] = dict.fromkeys(sums[predictions.MODEL], np.array([1 / classes, 1.0]))
         part = ", ".join(filter(None, (sensor_title(sensor), place)))
         questions[Question(part, place=int(settings["elsewhere"]))] = PredictorErrors(
             headline.MEASURE, {name: predictor_sums for name, predictor_sums in sums.items() if predictor_sums}
@@ -331,6 +245,6 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
         seed=result.params.get("seed"),
         fold=result.config.get("fold"),
         published=result.published,
-        control=not has_usual_settings(settings, "elsewhere"),
+        control=any(settings[name] not in usual for name, usual in _COMPETING.items()),
         details=result,
     )

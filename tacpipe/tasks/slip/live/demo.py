@@ -1,8 +1,8 @@
 """A live session without hardware: `make live-demo`.
 
-A model is trained on simulated trials whose slips the planned motion causes. Then the first paper's rig is emulated with
-further such trials, a controller sends its plans, and the session runs on it. At the end, the slips of the simulation
-and the alarms are printed, and drawn. Seeds and parameters of the simulation are those of the constants below.
+A model is trained on simulated trials whose slips the planned motion causes. Then further such trials are replayed as the
+first paper's rig, a controller sends its plans, and the session runs on it. At the end, the slips of the simulation and
+the alarms are printed, and drawn. Seeds and parameters of the simulation are those of the constants below.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 import tacpipe
-from tacpipe.arrays import AnyFloats
+from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.sensors import plan
 from tacpipe.simulation import pick_and_move
-from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.simulation.emulation.world import World
+from tacpipe.simulation.emulation.emulator import ReplayEmulator
+from tacpipe.simulation.emulation.replay import Replay
 from tacpipe.tasks.slip.calibration import EventScore
 from tacpipe.tasks.slip.labels import SlipLabels, merge_events, run_times
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
@@ -38,18 +39,19 @@ from tacpipe.tasks.slip.windows import GraspTrack
 
 
 @contextlib.contextmanager
-def send_plans(emulator: Emulator, port: int, rate_hz: float) -> Iterator[None]:
-    """Send plans at a rate to a UDP port of this computer in the block."""
+def send_plans(poses_at: Callable[[Times], Floats], epoch_ns: int, port: int, rate_hz: float) -> Iterator[None]:
+    """Send plans at a rate to a UDP port of this computer in the block.
+
+    ``poses_at`` returns the poses (time, 7) at times since ``epoch_ns`` on the monotonic clock.
+    """
     is_over = threading.Event()
     offset_ns = time.time_ns() - time.monotonic_ns()
 
     def send_repeatedly() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
             while not is_over.wait(1 / rate_hz):
-                since_ns = time.monotonic_ns() - emulator.epoch_ns
-                t_ns = since_ns + pick_and_move.plan_points_ns()
-                poses = emulator.world.arm(t_ns)[:, 1:]
-                packet = plan.packet((t_ns + emulator.epoch_ns + offset_ns).tolist(), poses)
+                t_ns = time.monotonic_ns() - epoch_ns + pick_and_move.plan_points_ns()
+                packet = plan.packet((t_ns + epoch_ns + offset_ns).tolist(), poses_at(t_ns))
                 controller.sendto(packet, ("127.0.0.1", port))
 
     controller = threading.Thread(target=send_repeatedly, daemon=True)
@@ -63,8 +65,9 @@ def send_plans(emulator: Emulator, port: int, rate_hz: float) -> Iterator[None]:
 
 TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # ratio of the plan's largest load to the friction limit: each trial slips because of its plan
-SEED = 7  # seed of the emulated world
-LIVE_S = 60.0  # duration of the emulated trials
+SEED = 7  # seed of the replayed trials
+REPLAYED = ("--trials", "6", "--duration-s", "10.5", "--same-skins")  # trials that are replayed
+LIVE_S = 60.0  # duration of the session in the replayed trials
 IDLE_S = 20.0  # duration before the trials with open fingers, in which the session starts and measures the rest level
 PLAN_RATE_HZ = 10.0  # plans per second
 PER_MINUTE = "1"  # false alarms per minute for which the alarm's level was set
@@ -73,7 +76,6 @@ TRAINING = (
     *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2", "--actions", "planned"),
 )
 VALIDATION = ("--val", "0.25", "--test", "0")  # validation recordings set the level of the alarm
-SWITCH_S = 0.0005
 BEFORE_MS, AFTER_MS = 500.0, 200.0  # duration around a slip that is drawn enlarged
 MAX_DRAWN_SLIPS = 6
 LINE, ALARM, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
@@ -86,29 +88,41 @@ def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
     """
     _train(output, seed)
     (port,) = free_ports(1)
-    world = World(SEED, pick_and_move.PickRig(effort=EFFORT), idle_s=IDLE_S)
-    sys.setswitchinterval(SWITCH_S)
-    with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
-        (output / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
+    replayed = output / "replayed"
+    _simulate(SEED, REPLAYED, replayed)
+    with ReplayEmulator(rigs.read(rig_file), tacpipe.open(replayed), output / "emulated", IDLE_S) as emulator:
         rig, model = str(output / "emulated" / "rig.toml"), str(output / "model")
-        with send_plans(emulator, port, PLAN_RATE_HZ):
+        Path(rig).write_text(rigs.to_toml(emulator.rig))
+        with send_plans(poses_of(emulator.replay), emulator.epoch_ns, port, PLAN_RATE_HZ):
             _tacpipe(
                 *("live", rig, "--model", model, "-o", str(output / "live"), "--plan", f"udp:127.0.0.1:{port}"),
                 *("--duration-s", f"{IDLE_S + LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
             )
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
-    return _show_session(output, world, epoch_ns)
+    return _show_session(output, emulator.replay.table("truth", ["gt_slip"]), epoch_ns)
+
+
+def poses_of(replay: Replay) -> Callable[[Times], Floats]:
+    """Return a function that returns the poses (time, 7) of the replayed hand at times since the start of the rig."""
+    table = replay.table("robot", plan.POSE)
+    times, poses = table.column("t_ns").to_numpy(), [table.column(name).to_numpy() for name in plan.POSE]
+    return lambda t_ns: np.column_stack([np.interp(t_ns, times, pose) for pose in poses])
 
 
 def _train(output: Path, seed: int) -> None:
     """Simulate trials and train on them; stored results are reused."""
     recordings, split = str(output / "recordings"), str(output / "split")
-    options = ("--trials", str(TRIALS), "--seed", str(TRAINING_SEED), "--effort", str(EFFORT))
-    planned = ("--plan-rate-hz", f"{PLAN_RATE_HZ:g}")
-    _tacpipe("simulate", "forward", *options, *planned, "-o", recordings, "--quiet")
+    _simulate(TRAINING_SEED, ("--trials", str(TRIALS), "--plan-rate-hz", f"{PLAN_RATE_HZ:g}"), output / "recordings")
     _tacpipe("split", recordings, "-o", split, "--scheme", "random", *VALIDATION, "--seed", str(seed))
     params = (*TRAINING, "--seed", str(seed))
     _tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *params, "--quiet")
+
+
+def _simulate(seed: int, options: Sequence[str], output: Path) -> None:
+    """Simulate trials that slip because of their plan."""
+    _tacpipe(
+        *("simulate", "forward", "--seed", str(seed), "--effort", str(EFFORT), *options, "-o", str(output), "--quiet")
+    )
 
 
 def _tacpipe(*words: str) -> None:
@@ -120,10 +134,11 @@ def _tacpipe(*words: str) -> None:
         raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
 
 
-def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
+def _show_session(output: Path, truth: pa.Table, epoch_ns: int) -> Path:
     """Print and draw the last session next to the slips of the simulation; return the path of the picture.
 
-    Raises `TacpipeError` if the session began after the first trial.
+    ``truth`` has the slips at times since the start of the rig, which is at ``epoch_ns``. Raises `TacpipeError` if the
+    session began after the first trial.
     """
     recordings = tacpipe.open(output / "live")
     recording = recordings[max(recordings.recordings)]
@@ -136,8 +151,8 @@ def _show_session(output: Path, world: World, epoch_ns: int) -> Path:
     stream = recording.table("slip").to_pandas()
     stream = stream[(stream["t_device_ns"] >= began_ns) & (stream["t_device_ns"] < ended_ns)]
     t_ns = stream["t_device_ns"].to_numpy()
-    truth_ns = np.arange(began_ns, ended_ns, 1_000_000, dtype=np.int64)
-    slipping = world.contact(truth_ns - epoch_ns, lambda scene: scene.contact.slip.astype(np.float64)) > 0.5
+    truth_ns, slipping = truth.column("t_ns").to_numpy() + epoch_ns, truth.column("gt_slip").to_numpy() > 0
+    truth_ns, slipping = truth_ns[truth_ns < ended_ns], slipping[truth_ns < ended_ns]
     track = dataclasses.replace(
         model.reader.track(recording), labels=SlipLabels(merge_events([run_times(truth_ns, slipping)]), None)
     )

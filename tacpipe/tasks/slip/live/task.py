@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
@@ -49,7 +50,6 @@ class SlipLive(LiveTask):
         Raises `TacpipeError` if the model was trained on the output of a stage, or does not run live; `UsageError` if the
         rig lacks a stream of the model, the model an alarm, or a model that reads plans a source of them.
         """
-        from tacpipe.datasets import model_files
         from tacpipe.live import plans
 
         own = _own(settings)
@@ -94,7 +94,7 @@ class SlipLive(LiveTask):
         if not loaded.scorer.runs_live:
             raise UsageError("The rule on forecasts does not run live. Train a model with --architecture boosting.")
         name = _level_name(loaded.calibration.levels, _own(settings).alarms_per_minute)
-        fingers = loaded.reader.fingers
+        fingers = loaded.reader.streams
         layouts = {finger.stream: _grid(finger.layout) for finger in fingers}
         description = SlipDescription(settings.model, loaded.config["rate_hz"], loaded.params.horizon_s, name, layouts)
         windows = [np.zeros((finger.rows, len(finger.channels))) for finger in fingers]

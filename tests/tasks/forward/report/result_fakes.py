@@ -101,7 +101,6 @@ def result(
         "metrics.json": json.dumps(metrics(by_recording)).encode(),
         "errors.parquet": errors(ratios),
         "history.jsonl": b'{"epoch": 1, "train_loss": 0.2, "val_loss": 0.3}\n',
-        "trials.csv": trials(by_recording),
     }
     latents = [f"z{index:02d}" for index in range(4)]
     marked = {"published": "xela-flat"} if attributes is None else dict(attributes)
@@ -118,13 +117,6 @@ def metrics(ratio: Mapping[str, float]) -> dict[str, Any]:
     return tree
 
 
-def trials(ratio: Mapping[str, float]) -> bytes:
-    """Return ``trials.csv``."""
-    lines = [f"{name},false,{WINDOWS[name]},{value},1.0,{1 - value}" for name, value in ratio.items()]
-    head = "recording,seen,windows,mse_counts_model,mse_counts_persistence,skill"
-    return "\n".join([head, *lines, "old,true,5,0.1,1.0,0.9", ""]).encode()
-
-
 def predictions(latents: Sequence[str], rows: int = 40) -> pa.Table:
     """Return a shard of predictions: what was and what was forecast at each row."""
     t = np.arange(rows)
@@ -133,24 +125,6 @@ def predictions(latents: Sequence[str], rows: int = 40) -> pa.Table:
         for step in (0, 1, 3, 5, 10):
             columns[f"{name}_t{step}" if step else name] = np.sin((t + step) / (4 + index)).astype(np.float32)
     return pa.table(columns)
-
-
-def codec(latents: int, kind: str = "pca", loss: float = 0.5, **content: Any) -> Any:
-    """Return a dataset of ``tacpipe compress``, or rather its ``codec.json``."""
-    described = {
-        "kind": kind,
-        "of": "levels",
-        "frames": 1,
-        "latents": latents,
-        "explained_ratio": [0.5, 0.25, 0.125, 0.125],
-        "latent_covariance": np.diag(np.arange(latents, 0.0, -1.0)).tolist(),
-        "reconstruction": {
-            "train": {"rows": 10, "mse_standardised": loss / 2, "mae_counts": 10 * loss},
-            "val": {"rows": 5, "mse_standardised": loss, "mae_counts": 20 * loss},
-        },
-        **content,
-    }
-    return FakeDataset(files={"codec.json": json.dumps(described).encode()})
 
 
 def _part(ratio: Mapping[str, float], names: Sequence[str]) -> dict[str, Any]:

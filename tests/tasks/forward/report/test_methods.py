@@ -10,7 +10,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
-from tacpipe.report.blocks import Charts, Fold, Table
+from tacpipe.report.blocks import Fold
 from tacpipe.tasks.forward.report import methods
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -27,15 +27,12 @@ def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
     assert sums_read.known.tolist() == [False, True]
     assert sums_read.windows.tolist() == [10, 30]
     assert sums_read.channels == GROUPS
-    sums = sums_read.of("model", "x")
-    assert sums is not None
+    sums = sums_read.sums["model", "x"]
     assert sums[0].tolist() == [
         [0.5 * 10 * 4 * step for step in (1, 2, 3)],
         [0.25 * 30 * 4 * step for step in (1, 2, 3)],
     ]
     assert sums[1].tolist() == (2 * sums[0]).tolist()
-    assert sums_read.of("nobody", "x") is None
-    assert sums_read.of("model", "y") is None
 
 
 def test_recordings_that_were_trained_on_are_left_out() -> None:
@@ -50,8 +47,8 @@ def test_a_predictor_that_lacks_a_group_has_no_errors_there() -> None:
     content = io.BytesIO()
     pq.write_table(table.filter(lacking), content)
     sums_read = methods.read_error_sums(content.getvalue())
-    assert sums_read.of("model", "feature") is None
-    assert sums_read.of("persistence", "feature") is not None
+    assert ("model", "feature") not in sums_read.sums
+    assert ("persistence", "feature") in sums_read.sums
 
 
 def test_a_missing_column_and_uneven_windows_are_refused() -> None:
@@ -91,11 +88,10 @@ def calibrate(**options: Any) -> Any:
         for step in STEPS
     ]
     curves = {"t_s": [1.0, 1.1], "measured": [3.0, 4.0], "q10": [1.0, 2.0], "q50": [3.0, 3.5], "q90": [4.0, 6.0]}
-    tree = {**json.loads(plain.files["metrics.json"]), "quantiles": QUANTILES}
     more_files = {
         "coverage.parquet": to_parquet(pa.Table.from_pylist(rows)),
         "bands.json": json.dumps([{"recording": "r1", "channel": "xela1_taxel01_z", "step": 3, **curves}]).encode(),
-        "metrics.json": json.dumps(tree).encode(),
+        "config.json": json.dumps({**json.loads(plain.files["config.json"]), "quantiles": QUANTILES}).encode(),
     }
     return FakeDataset(plain.recordings, {**plain.files, **more_files}, plain.manifest)
 
@@ -106,16 +102,17 @@ def uncertainty(*results: Any) -> list[Fold]:
 
 def test_coverage_and_pinball_loss_are_pooled_over_recordings_that_were_not_seen() -> None:
     (fold,) = uncertainty(calibrate(), calibrate(seed=1))
-    (table,) = [block for block in fold.blocks if isinstance(block, Table)]
-    rows = [[getattr(cell, "text", cell) for cell in row.cells] for group in table.groups for row in group.rows]
-    assert rows[0] == ["known objects: quantiles of the model", "t+1", "2", "0.8", "2", "0.4", "20"]
-    assert rows[-1][:4] == ["unseen objects: persistence, quantiles of its errors", "t+1", "1", "0.6"]
+    known_table, unseen_table = parts.tables([fold])
+    assert known_table.title == "recurrent · raw, known objects; width and pinball loss in counts"
+    rows = [[getattr(cell, "text", cell) for cell in row.cells] for row in (*known_table.rows, *unseen_table.rows)]
+    assert rows[0] == ["t+1: model", "40", "80", "2", "0.4", "20"]
+    assert rows[-1][:3] == ["t+3: persistence", "20", "60"]
 
 
 def test_coverage_is_drawn_by_step_and_a_forecast_with_its_band() -> None:
     (fold,) = uncertainty(calibrate())
-    titles = [chart.title for block in fold.blocks if isinstance(block, Charts) for chart in block.charts]
-    assert titles == ["Coverage: known objects", "Coverage: unseen objects", "r1: xela1_taxel01_z"]
+    titles = [chart.title.removeprefix("Coverage of the 10 to 90 % band: ") for chart in parts.charts([fold])]
+    assert titles == ["recurrent · raw, known objects", "recurrent · raw, unseen objects", "r1: xela1_taxel01_z"]
 
 
 def test_results_without_quantiles_have_no_such_part() -> None:

@@ -16,6 +16,7 @@ import pytest
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison
 from tacpipe.comparison.runs import Method, grouped
+from tacpipe.report import differences
 from tacpipe.tasks.forward.report import methods
 from tests.fake_recordings import FakeDataset
 from tests.tasks.forward.report.result_fakes import WINDOWS, errors, result
@@ -186,21 +187,10 @@ def test_a_name_states_only_in_what_methods_differ() -> None:
         "tcn · PCA-20",
     ]
     planned, none, fresh = (methods_by_name[f"recurrent · PCA-20{end}"] for end in ("", " · no actions", " · fresh"))
-    keys = {
-        setting: [method.key_without(setting) for method in (planned, none, fresh)]
-        for setting in ("actions", "timeline")
-    }
-    assert keys["actions"][0] == keys["actions"][1] != keys["actions"][2]
-    assert keys["timeline"][0] == keys["timeline"][2] != keys["timeline"][1]
-
-
-def test_the_papers_method_is_the_recurrent_one_of_twenty_components() -> None:
-    results = [result("raw"), result("AE-C1-8"), result("PCA-8"), result("PCA-20"), result(architecture="tcn")]
-    methods_by_name = methods_named(*results)
-    assert methods.paper_method(list(methods_by_name.values())) is methods_by_name["recurrent · PCA-20"]
-    nearest = methods.paper_method(list(methods_named(*results[:2]).values()))
-    assert nearest is not None and nearest.name == "recurrent · AE-C1-8"
-    assert methods.paper_method(list(methods_named(result(architecture="tcn")).values())) is None
+    assert list(differences.pairs_by_setting([planned, none, fresh])) == [
+        ("actions", planned, none),
+        ("timeline", planned, fresh),
+    ]
 
 
 def test_most_runs_decide_which_timeline_is_the_main_one() -> None:

@@ -138,34 +138,7 @@ def history(sensors: Sequence[str], epochs: int, alignment: float, joint: bool) 
     return lines
 
 
-def recorded(count: int = 3, outside: int = 1) -> Any:
-    """Return slides of BioTac, the first ``outside`` of which did not keep to the protocol, and one of RoboSkin."""
-    shards: dict[str, Any] = {}
-    time = np.arange(600)
-    for index in range(count):
-        phase = np.where(time < 100, -1, np.where(time < 500, 0, 1)).astype(np.int8)
-        raw = 0.025 * (phase == 0) + 0.002 * np.random.default_rng(index).normal(size=600)
-        profile = pa.table(
-            {
-                "t_ns": time * 10_000_000,
-                "pressure_count": 30.0 + (phase == 0),
-                "speed_raw_m_s": raw,
-                "speed_m_s": np.median([raw, np.roll(raw, 1), np.roll(raw, -1)], axis=0),
-                "force_n": (1.0 + index) * (phase == 0),
-                "phase": phase,
-            }
-        )
-        cause = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
-        attributes: dict[str, Any] = {
-            "published": "biotac-slide",
-            "sensor": "biotac",
-            "force_n": 1.0 + index,
-            "outside_protocol": index < outside,
-            **cause,
-        }
-        shards[f"biotac-m01-t{index:03d}"] = FakeRecording(
-            {"slide": profile, "profile": profile}, f"biotac-m01-t{index:03d}", attributes
-        )
-    attributes = {"published": "roboskin", "sensor": "roboskin", "outside_protocol": False}
-    shards["roboskin-test-000"] = FakeRecording({"slide": pa.table({"t_ns": [0]})}, "roboskin-test-000", attributes)
-    return FakeDataset(shards)
+def recorded() -> Any:
+    """Return a dataset of slides."""
+    slides = {name: FakeRecording({"slide": pa.table({"t_ns": [0]})}, name, {}) for name in ("a", "b")}
+    return FakeDataset(slides)

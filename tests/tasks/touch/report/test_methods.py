@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method
-from tacpipe.tasks.touch.report.methods import default_method, grouped_by_split, one_per_architecture
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import result
 
@@ -56,7 +56,7 @@ def test_a_name_states_that_the_papers_network_was_trained_for_fewer_epochs_than
         short.files["config.json"] = short.files["config.json"].replace(b'"epochs": 250', b'"epochs": 15')
     assert [one.name for one in methods(*given)] == [
         "PointNet",
-        "PointNet (15 of 250 epochs) · head fc1",
+        "PointNet (15 of 250 epochs)",
         "PointNet · epochs 15",  # the paper trained on no such recordings
         "PointNet · points 250",
     ]
@@ -86,7 +86,7 @@ def test_marks_of_other_settings_come_behind_the_colour() -> None:
     method_list = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
     assert [method.name for method in method_list] == [
         "tree-ensemble",
-        "tree-ensemble · without colour",
+        "tree-ensemble · without colour · leaf 0",
         "tree-ensemble · without colour · leaf 4",
     ]
 
@@ -97,39 +97,19 @@ def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
     assert sorted(len(method.runs) for method in method_list) == [1, 1, 2]
 
 
-def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None:
-    groups = grouped_by_split(
-        methods(
+def test_each_split_is_a_question_of_its_own_recorded_grasps_first() -> None:
+    comparisons = engine.compare(
+        [
             *(result("pointnet", split="folds", seed=seed, targets=("pdc_th",)) for seed in range(5)),
             result(split="random"),
             result("trees", split="random"),
             result(simulated=True),
-        )
+        ]
     )
-    assert [
-        (first_methods[0].settings["split"], first_methods[0].settings["simulated"]) for first_methods in groups
-    ] == [
-        ("random", False),
-        ("folds", False),
-        ("random", True),
-    ]
-    assert [method.name for method in groups[0]] == ["tree-ensemble", "trees on geometry and colour"]
-    assert {method.name for group in groups for method in group} == {
-        "tree-ensemble",
-        "PointNet",
-        "trees on geometry and colour",
+    rows = {comparison.question.part: {row.name for row in comparison.models} for comparison in comparisons}
+    assert rows == {
+        "known objects, random": {"tree-ensemble", "trees on geometry and colour"},
+        "known objects, folds": {"PointNet"},
+        "known objects, random, simulated": {"tree-ensemble"},
     }
-
-
-def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
-    (group,) = grouped_by_split(methods(result(), result("trees", seed=0), result("trees", seed=1)))
-    assert default_method(group).name == "tree-ensemble"
-    (other_group,) = grouped_by_split(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
-    assert default_method(other_group).name == "trees on geometry and colour"
-
-
-def test_one_method_an_architecture_is_told_in_detail() -> None:
-    (group,) = grouped_by_split(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
-    assert [method.name for method in one_per_architecture(group)] == ["PointNet", "tree-ensemble"]
-    (tree_group,) = grouped_by_split(methods(result("trees", inputs="xyzcont"), result("trees")))
-    assert [method.name for method in one_per_architecture(tree_group)] == ["trees on geometry and colour"]
+    assert list(rows) == ["known objects, random", "known objects, folds", "known objects, random, simulated"]

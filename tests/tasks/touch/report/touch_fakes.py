@@ -9,8 +9,6 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
-from tacpipe.clouds.cloud import Cloud
-from tacpipe.clouds.grasp import Grasp
 from tests.fake_recordings import FakeDataset, FakeRecording
 
 KNOWN, NOVEL = ("bleach", "coffee", "spam"), ("drill", "shoe")
@@ -125,20 +123,6 @@ def history(target: str, epochs: int, seed: int) -> list[dict[str, Any]]:
         line = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
         lines.append(line)
     return lines
-
-
-def recorded(names: Sequence[str] = ("bleach-001", "drill-002")) -> Any:
-    """Return grasps on halves of cylinders, as a camera above sees them."""
-    shards: dict[str, Any] = {}
-    for seed, name in enumerate(names):
-        rng = np.random.default_rng(seed)
-        angle, along = rng.uniform(np.pi, 2 * np.pi, 2000), rng.uniform(-0.1, 0.1, 2000)
-        points = np.column_stack([0.035 * np.cos(angle), along, 0.8 + 0.035 * np.sin(angle)]).astype(np.float32)
-        cloud = Cloud(points, np.full(points.shape, 128, np.uint8))
-        grasp = Grasp(np.array([-0.035, 0.02, 0.8]), np.array([0.035, 0.02, 0.8]))
-        tables = {"cloud": cloud.table(), "grasp": grasp.table(0), "reading": pa.table({"t_ns": [0]})}
-        shards[name] = FakeRecording(tables, name, {"object": name.partition("-")[0]})
-    return FakeDataset(shards)
 
 
 def _table(touch: Mapping[str, AnyArray]) -> pa.Table:

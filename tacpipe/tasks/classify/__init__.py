@@ -1,0 +1,1 @@
+"""Name labels from touch."""

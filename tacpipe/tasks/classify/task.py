@@ -1,0 +1,69 @@
+"""Define the task ``classify``: a label from windows of touch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Result, Workspace, stage
+from tacpipe.tasks.classify.params import Params
+from tacpipe.tasks.learning.task import LearnedTask
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.live.settings import LiveTask
+
+REQUIREMENTS = Requirements(
+    "classify",
+    stages=(),
+    optional_stages=("synchronize, or segment, or none",),
+    roles="recordings of each class with the role train",
+    channels=(
+        Channels(
+            "tactile",
+            (),
+            "any number of columns, in rows at a nearly constant rate; others with --inputs",
+        ),
+    ),
+    labels=(
+        Label("object", "any label, column or kind of labelled intervals", "Without it, --label names another one."),
+        Label(
+            "session",
+            "any label, by --group and --recentre",
+            "Without --group, each recording is left out by itself in cross-validation.",
+        ),
+    ),
+)
+
+
+class ClassifyTask(LearnedTask):
+    """Name a label from touch."""
+
+    name = "classify"
+    requirements = REQUIREMENTS
+    states = "probabilities"
+
+    @staticmethod
+    @stage(version=1)
+    def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
+        """Train a model that names a label from touch.
+
+        The label is one of the recordings, and then the model reads each recording as a whole; or a column or labelled
+        intervals, and then it reads a window of touch. By default, cross-validation within the training recordings
+        chooses the estimator, and a baseline if no estimator is better. Validation recordings are left for
+        `tacpipe calibrate`.
+
+        Example: tacpipe train classify data/grasps --split data/grasps-split --label object -o models/object
+        """
+        from tacpipe.tasks.learning import training
+        from tacpipe.tasks.learning.answers import Classes
+
+        files, notes = training.train("classify", params, Classes.find(train, params.label), train, workspace)
+        return Result(files=files, notes=notes)
+
+    @property
+    def live(self) -> LiveTask:
+        """Answers at each row."""
+        from tacpipe.tasks.learning.live.task import ClassifyLive
+
+        return ClassifyLive()

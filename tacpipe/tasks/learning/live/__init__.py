@@ -1,0 +1,1 @@
+"""Answer windows of touch while the rig runs."""

@@ -1,0 +1,156 @@
+"""Run models of quantities and of classes live: session plan, engine, and causal predictions."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from tacpipe.datasets import model_files
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.printable import listed
+from tacpipe.sensors.live import Declaration
+from tacpipe.tasks.learning.live.messages import CLASS, CLASSES, ESTIMATE, ESTIMATES
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.recording.rig import Rig
+    from tacpipe.sensors.sensor import Options, Sensor
+    from tacpipe.store.records import Step
+    from tacpipe.tasks.learning.live.engine import WindowEngine
+    from tacpipe.tasks.learning.live.windows import LiveWindows, RestLevels
+    from tacpipe.tasks.learning.model import LearnedModel
+    from tacpipe.tasks.task import PredictionRequest
+
+SYNCHRONIZE, BLOCKS = "synchronize", "segment.blocks"
+CAUSAL = (SYNCHRONIZE, BLOCKS)  # stages whose rows a session computes; blocks only cut recordings
+
+
+class LearnedLive(LiveTask):
+    """An answer at each row."""
+
+    settings: ClassVar[type[TaskSettings]] = TaskSettings
+    stream: ClassVar[str]  # the recorded stream
+
+    def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
+        """Return the streams of answers and latencies.
+
+        Raises `TacpipeError` if the model reads what a session cannot know, and `UsageError` if the rig lacks a stream.
+        """
+        config = model_files.tree(model.files, model_files.CONFIG, {"inputs": list, "answers": dict, "params": dict})
+        check_causal(model.source.chain, config["params"], allow_look_ahead=settings.allow_look_ahead)
+        for stream in config["inputs"]:
+            if stream["stream"] not in rig.streams:
+                raise UsageError(
+                    f"The model reads the stream {stream['stream'] or 'of a single table'}, and the rig has "
+                    f"{listed(rig.streams)}. Take the rig that the model was trained on."
+                )
+        targets = config["answers"].get("targets")
+        options: Options = {
+            "channels": [target["name"] for target in targets] if targets else config["answers"]["classes"]
+        }
+        if targets:
+            options = {**options, "unit": ",".join(target["unit"] or "1" for target in targets)}
+        return SessionPlan(rig, settings.task, {self.stream: options, "latency": {}})
+
+    def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> WindowEngine:
+        """Return the engine of a session, which has answered its first window.
+
+        Raises `UsageError` if a stream or a channel that the model reads is missing.
+        """
+        from tacpipe.live.decoding import likely_schema
+        from tacpipe.tasks.learning.live.answering import AnswerEngine
+        from tacpipe.tasks.learning.model import LearnedModel
+
+        loaded = LearnedModel.load(model.files)
+        schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
+        open_windows = functools.partial(
+            windows_for, loaded, model.source.chain, schemas, rig.master or str(loaded.config["master"])
+        )
+        engine = AnswerEngine(loaded, sensors, open_windows, settle_ns=round(settings.settle_ms * 1e6))
+        engine.prepare()  # this imports and allocates everything, so that the first sample does not wait
+        return engine
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return the answers that a session would publish for recordings as they were recorded."""
+        from tacpipe.live.stages import arrival_streams, streams_as_recorded
+        from tacpipe.tasks.learning.live.answering import outputs_of
+        from tacpipe.tasks.learning.live.windows import replayed
+        from tacpipe.tasks.learning.model import LearnedModel
+
+        loaded = LearnedModel.load(model.files)
+        chain = model.source.chain
+        check_causal(chain, loaded.config["params"], allow_look_ahead=request.allow_look_ahead)
+        levels = loaded.quantile_places(request.quantiles)
+        outputs = {}
+        for name, recording in sorted(recordings.recordings.items()):
+            tables = streams_as_recorded(recording)
+            schemas = {stream: table.schema for stream, table in tables.items()}
+            master = str(recording.attributes.get("master") or loaded.config["master"])
+            windows = windows_for(loaded, chain, schemas, master, {}, arrival_streams(recording, tables))
+            rows = [row for row in replayed(windows, tables) if row.windows is not None]
+            table = loaded.to_table([row.t_ns for row in rows], outputs_of(loaded, rows), levels)
+            outputs[name] = RecordingOutput(table, {"causal": True})
+        return Result(outputs)
+
+
+class RegressLive(LearnedLive):
+    """Estimates of quantities."""
+
+    declaration: ClassVar[Declaration] = ESTIMATES
+    stream: ClassVar[str] = ESTIMATE
+
+
+class ClassifyLive(LearnedLive):
+    """Names of classes."""
+
+    declaration: ClassVar[Declaration] = CLASSES
+    stream: ClassVar[str] = CLASS
+
+
+def check_causal(chain: Sequence[Step], params: Mapping[str, Any], *, allow_look_ahead: bool) -> None:
+    """Raise `TacpipeError` for a model of rows that a session cannot compute, or that looks ahead."""
+    from tacpipe.live.stages import stage_params
+
+    for step in chain:
+        if step["stage"] not in CAUSAL:
+            raise TacpipeError(
+                f"The model was trained on the output of `tacpipe {step['stage'].replace('.', ' ')}`, which a session does "
+                f"not run. Train it on recordings, or on the output of `tacpipe synchronize`."
+            )
+    if params.get("recentre"):
+        raise TacpipeError(
+            f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Train "
+            f"it without --recentre."
+        )
+    synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
+    if synchronize is not None and synchronize.values == "interpolate" and not allow_look_ahead:
+        raise TacpipeError(
+            "The model was trained on rows whose values are interpolated, and a live session has no later samples. Train it "
+            "on rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
+        )
+
+
+def windows_for(
+    model: LearnedModel,
+    chain: Sequence[Step],
+    schemas: Mapping[str, pa.Schema],
+    master: str,
+    rest: RestLevels,
+    arrivals: Collection[str] = (),
+) -> LiveWindows:
+    """Return the windows of a model in streams with these ``schemas``, as they are recorded.
+
+    Raises `UsageError` if a stream or a channel is missing.
+    """
+    from tacpipe.live.stages import stage_params
+    from tacpipe.tasks.learning.live.windows import RecordedWindows, SynchronizedWindows
+
+    synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
+    if synchronize is None:
+        return RecordedWindows(model.inputs, rest)
+    return SynchronizedWindows(model.inputs, rest, synchronize, schemas, synchronize.master or master, arrivals)

@@ -1,0 +1,154 @@
+"""Params of `tacpipe train regress` and `tacpipe train classify`, and the estimators that both offer.
+
+An architecture of another package extends `RegressParams` or `ClassifyParams` (`tacpipe.tasks.regress.params`,
+`tacpipe.tasks.classify.params`): its `candidates` return functions that fit an `OutputEstimator`, and `load_estimator`
+reads one.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tacpipe.plugins.constraints import Names, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, Unit
+from tacpipe.plugins.params import Panels
+from tacpipe.tasks.task import ModelConfig
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import AnyArray
+    from tacpipe.tasks.learning.estimators import OutputEstimator
+    from tacpipe.tasks.learning.inputs import StreamConfig
+    from tacpipe.tasks.learning.selection import CandidateLoss, CurvePoint, Fit
+
+
+SIZES = ("trees", "leaf", "leaves", "learning_rate", "l2")  # params of the estimators
+SHARED_PANELS: Panels = {"Training": ("group", "curve", "stride", "seed"), "Data": ("inputs", "rest_s", "recentre")}
+
+
+@dataclass(frozen=True)
+class LearningParams(ABC):
+    """Params of all models of a label or a quantity."""
+
+    KIND: ClassVar[Literal["quantity", "class"]]
+    architecture: str = "auto"
+    inputs: Names = ""  # patterns of the columns to read, as taxel*; empty: all tactile columns
+    # time that the model looks back; without it 0.5 s for a column, and the whole recording for its label
+    context_s: Annotated[NonNegativeFloat, Unit("s")] | None = None
+    # duration at the start of a recording whose mean is the rest level; 0: values are read as they are
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.0
+    # label, as session, from each of whose values the median of all rows is subtracted; offline only; empty: none
+    recentre: str = ""
+    stride: PositiveInt = 1  # rows between two training windows
+    # labels whose recordings cross-validation leaves out together; empty: those of the split, else each recording
+    group: Names = ""
+    curve: bool = False  # also learn from parts of the training recordings, for a learning curve in the report
+    seed: Seed = 0  # random seed
+
+    @abstractmethod
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return functions that fit an estimator, by name in the order of simplicity; cross-validation chooses one.
+
+        ``workspace`` is a folder for checkpoints, so that training can resume.
+        """
+
+    def load_estimator(
+        self, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], outputs: int
+    ) -> OutputEstimator:
+        """Return an estimator of so many outputs from its stored parts. Raises `ValueError` if they do not fit."""
+        from tacpipe.tasks.learning import estimators
+
+        return estimators.load(arrays, described, outputs)
+
+
+class AutoEstimator(LearningParams):
+    """The simplest of linear, trees and boosting within one standard error, or a baseline if none is better."""
+
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return the candidates with their default sizes."""
+        from tacpipe.tasks.learning.estimators import FittedBoosting, FittedLinear, FittedTrees
+
+        return {
+            "linear": lambda examples, outputs, part: FittedLinear.fit(examples, outputs, self.KIND),
+            "trees": lambda examples, outputs, part: FittedTrees.fit(examples, outputs, self.KIND, seed=self.seed),
+            "boosting": lambda examples, outputs, part: FittedBoosting.fit(
+                examples, outputs, self.KIND, seed=self.seed
+            ),
+        }
+
+
+class LinearEstimator(LearningParams):
+    """Ridge regression, or logistic regression of classes, on features of the window."""
+
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return the regression."""
+        from tacpipe.tasks.learning.estimators import FittedLinear
+
+        return {"linear": lambda examples, outputs, part: FittedLinear.fit(examples, outputs, self.KIND)}
+
+
+@dataclass(frozen=True)
+class TreesEstimator(LearningParams):
+    """Extremely randomised trees on features of the window."""
+
+    trees: PositiveInt = 100  # number of trees
+    leaf: PositiveInt = 2  # minimum number of windows per leaf
+
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return the trees."""
+        from tacpipe.tasks.learning.estimators import FittedTrees
+
+        return {
+            "trees": lambda examples, outputs, part: FittedTrees.fit(
+                examples, outputs, self.KIND, trees=self.trees, leaf=self.leaf, seed=self.seed
+            )
+        }
+
+
+@dataclass(frozen=True)
+class BoostingEstimator(LearningParams):
+    """Gradient-boosted trees on features of the window."""
+
+    trees: PositiveInt = 200  # number of trees
+    leaves: Annotated[int, Range(2)] = 31  # maximum number of leaves of a tree
+    leaf: PositiveInt = 20  # minimum number of windows per leaf
+    learning_rate: PositiveFloat = 0.1  # weight of each tree
+    l2: NonNegativeFloat = 0.0  # L2 penalty on leaf values
+
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return the trees."""
+        from tacpipe.tasks.learning.estimators import FittedBoosting
+
+        return {
+            "boosting": lambda examples, outputs, part: FittedBoosting.fit(
+                examples,
+                outputs,
+                self.KIND,
+                trees=self.trees,
+                leaves=self.leaves,
+                leaf=self.leaf,
+                learning_rate=self.learning_rate,
+                l2=self.l2,
+                seed=self.seed,
+            )
+        }
+
+
+class LearnedConfig(ModelConfig):
+    """``config.json`` of a model of a label or a quantity."""
+
+    inputs: list[StreamConfig]
+    master: str  # stream whose samples make the rows of synchronized recordings; empty for others
+    whole_recordings: bool  # whether there is one window per recording
+    answers: dict[str, Any]  # targets, or label and classes
+    chosen: str  # name of the candidate
+    chosen_is_baseline: bool
+    candidates: list[CandidateLoss]
+    curve: list[CurvePoint]  # empty without a learning curve
+    estimator: dict[str, Any]  # settings of the estimator that are not arrays
+    baselines: dict[str, dict[str, Any]]  # baseline -> its settings that are not arrays
+    calibration: dict[str, Any]
+    group: list[str]  # labels by which recordings are grouped
+    counts: dict[str, int]  # numbers of training recordings, groups and windows

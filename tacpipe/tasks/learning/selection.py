@@ -1,0 +1,142 @@
+"""Choose an estimator by cross-validation within the training recordings: the simplest within one standard error.
+
+Groups of recordings are left out as a whole. Baselines take part, so that the chosen estimator is a baseline where no other
+is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypedDict
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Floats, Indices
+from tacpipe.errors import TacpipeError
+from tacpipe.io import terminal
+from tacpipe.tasks.learning.answers import ModelAnswers
+from tacpipe.tasks.learning.estimators import OutputEstimator
+from tacpipe.tasks.learning.examples import Examples
+
+FOLDS = 5
+FRACTIONS = (0.125, 0.25, 0.5, 1.0)  # fractions of the training groups of a learning curve
+# examples, their outputs, and the name of the part of the examples -> a fitted estimator
+Fit = Callable[[Examples, Floats, str], OutputEstimator]
+
+
+class CandidateLoss(TypedDict):
+    """The cross-validated loss of a candidate, and how much larger than the smallest it is, with its standard error."""
+
+    name: str
+    baseline: bool
+    loss: float
+    excess: float
+    error: float  # standard error of ``excess`` over the folds
+
+
+class CurvePoint(TypedDict):
+    """The cross-validated loss with a part of the training groups."""
+
+    groups: float  # mean number of groups that were learned from
+    loss: float
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen candidate, with its outputs for examples that it did not learn from."""
+
+    name: str
+    table: list[CandidateLoss]  # in the order of simplicity
+    outputs: Floats  # (example, output)
+
+
+def assign_folds(examples: Examples, seed: int) -> Indices:
+    """Return the fold of each example (example,): each group is in one fold, and folds have about equally many examples.
+
+    The examples of a single group are divided in their order into blocks. Raises `TacpipeError` for fewer than two
+    examples.
+    """
+    if len(examples) < 2:
+        raise TacpipeError(f"There are {len(examples)} examples to learn from, too few to compare estimators.")
+    names, numbers, counts = np.unique(np.array(examples.example_groups), return_inverse=True, return_counts=True)
+    if len(names) == 1:
+        return np.arange(len(examples)) * min(FOLDS, len(examples)) // len(examples)
+    folds, sizes = np.zeros(len(names), np.intp), np.zeros(min(FOLDS, len(names)))
+    order = np.random.default_rng(seed).permutation(len(names))
+    for group in order[np.argsort(-counts[order], kind="stable")].tolist():
+        folds[group] = sizes.argmin()
+        sizes[folds[group]] += counts[group]
+    return np.asarray(folds[numbers])
+
+
+def out_of_fold(fit: Fit, examples: Examples, outputs: Floats, folds: Indices, name: str) -> Floats:
+    """Return the outputs (example, output) for each fold by an estimator that learned from the other folds."""
+    predicted = np.empty_like(outputs)
+    for fold in np.unique(folds).tolist():
+        held_out = folds == fold
+        estimator = fit(examples.select(~held_out), outputs[~held_out], f"{name}-{fold}")
+        predicted[held_out] = estimator.outputs(examples.select(held_out))
+    return predicted
+
+
+def select(
+    baselines: Mapping[str, Fit], candidates: Mapping[str, Fit], answers: ModelAnswers, examples: Examples, seed: int
+) -> Selection:
+    """Return the simplest of baselines and candidates, in their order, within one standard error of the smallest loss.
+
+    The error is that of the difference of losses over folds.
+    """
+    folds, outputs = assign_folds(examples, seed), answers.encode(examples.values)
+    fits = {**baselines, **candidates}
+    predicted = {}
+    with terminal.progress_bar("cross-validate", len(fits)) as advance:
+        for name, fit in fits.items():
+            predicted[name] = out_of_fold(fit, examples, outputs, folds, name)
+            advance(note=name)
+    losses = {name: _fold_means(answers.losses(values, examples.values), folds) for name, values in predicted.items()}
+    best = min(losses, key=lambda name: float(losses[name].mean()))
+    table: list[CandidateLoss] = []
+    for name, by_fold in losses.items():
+        excess = by_fold - losses[best]
+        error = float(excess.std(ddof=1) / np.sqrt(len(excess))) if len(excess) > 1 else 0.0
+        table.append(
+            {
+                "name": name,
+                "baseline": name in baselines,
+                "loss": _rounded(by_fold.mean()),
+                "excess": _rounded(excess.mean()),
+                "error": _rounded(error),
+            }
+        )
+    chosen = next(row["name"] for row in table if row["excess"] <= row["error"])
+    return Selection(chosen, table, predicted[chosen])
+
+
+def learning_curve(fit: Fit, answers: ModelAnswers, examples: Examples, seed: int) -> list[CurvePoint]:
+    """Return the cross-validated loss of a candidate that learns from `FRACTIONS` of the groups of the other folds."""
+    folds, outputs = assign_folds(examples, seed), answers.encode(examples.values)
+    groups = np.array(examples.example_groups)
+    rng = np.random.default_rng(seed)
+    points: list[CurvePoint] = []
+    for fraction in FRACTIONS:
+        predicted, used = np.empty_like(outputs), []
+        for fold in np.unique(folds).tolist():
+            names = rng.permutation(np.unique(groups[folds != fold]))
+            kept = names[: max(1, round(fraction * len(names)))]
+            chosen = (folds != fold) & np.isin(groups, kept)
+            estimator = fit(examples.select(chosen), outputs[chosen], f"curve-{fraction:g}-{fold}")
+            predicted[folds == fold] = estimator.outputs(examples.select(folds == fold))
+            used.append(len(kept))
+        loss = _fold_means(answers.losses(predicted, examples.values), folds).mean()
+        points.append({"groups": float(np.mean(used)), "loss": _rounded(loss)})
+    return points
+
+
+def _fold_means(losses: AnyFloats, folds: Indices) -> Floats:
+    """Return the mean loss of each fold (fold,)."""
+    return np.array([losses[folds == fold].mean() for fold in np.unique(folds).tolist()])
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,1 @@
+"""Estimate quantities from touch."""

@@ -1,0 +1,78 @@
+"""Define the task ``regress``: quantities from windows of touch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.stage import Result, Workspace, stage
+from tacpipe.tasks.learning.task import LearnedTask
+from tacpipe.tasks.regress.params import Params
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.live.settings import LiveTask
+
+REQUIREMENTS = Requirements(
+    "regress",
+    stages=(),
+    optional_stages=(
+        "synchronize --truth, if the target is measured by another device than the touch",
+        "segment blocks, to test the last part of long recordings",
+    ),
+    roles="recordings with the role train",
+    channels=(
+        Channels(
+            "tactile",
+            (),
+            "any number of columns, in rows at a nearly constant rate; others with --inputs",
+        ),
+        Channels(
+            "any",
+            (),
+            "the target: columns of numbers in the rows of the touch, by --target",
+            "Without it, --target names labels of recordings that are numbers.",
+        ),
+    ),
+    labels=(
+        Label(
+            "session",
+            "any label, by --group and --recentre",
+            "Without --group, each recording is left out by itself in cross-validation.",
+        ),
+    ),
+)
+
+
+class RegressTask(LearnedTask):
+    """Estimate quantities from touch."""
+
+    name = "regress"
+    requirements = REQUIREMENTS
+    states = "quantiles"
+
+    @staticmethod
+    @stage(version=1)
+    def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
+        """Train a model that estimates quantities from touch.
+
+        The model reads a window of touch and estimates columns, such as a force, a position or an angle, or labels of
+        recordings that are numbers. By default, cross-validation within the training recordings chooses the estimator,
+        and a baseline if no estimator is better. Validation recordings are left for `tacpipe calibrate`.
+
+        Example: tacpipe train regress data/synced --split data/split --target gt_force_z_n -o models/force
+        """
+        from tacpipe.tasks.learning import training
+        from tacpipe.tasks.learning.answers import Quantities
+
+        patterns = [word.strip() for word in params.target.split(",") if word.strip()]
+        answers = Quantities.find(train, patterns, params.horizon_s)
+        files, notes = training.train("regress", params, answers, train, workspace)
+        return Result(files=files, notes=notes)
+
+    @property
+    def live(self) -> LiveTask:
+        """Estimates at each row."""
+        from tacpipe.tasks.learning.live.task import RegressLive
+
+        return RegressLive()
