@@ -88,7 +88,7 @@ rig-demo: $(VENV)/.dev ## replay simulated trials as the first paper's rig, reco
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
 
 live-demo: $(VENV)/.dev ## replay simulated slips as the first paper's rig and predict them live for 60 s; a summary and live-demo/live.png
-	@$(BIN)/python -m tacpipe.tasks.slip.live.demo live-demo rigs/first-paper.toml
+	@$(BIN)/python docs/live_demo.py live-demo rigs/first-paper.toml
 
 test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 5 minutes on 2 cores
 	@$(PYTEST) -m "not faults and not long and not rig"

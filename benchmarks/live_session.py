@@ -28,7 +28,7 @@ import tacpipe
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.simulation import pick_and_move
-from tacpipe.tasks.slip.live.demo import send_plans
+from tacpipe.simulation.emulation.controller import send_plans
 from tests.emulation.emulator import Emulator
 from tests.emulation.world import World
 

@@ -62,8 +62,6 @@ FREE = {  # params that are any text, and why
         )
     },
     "train.slip.streams": "patterns of streams of recordings",
-    "train.slip.forward_model": "the path of a model",
-    "train.slip.forward_digest": "the digest of a model",
     "train.touch.run_label": "words for a report",
     "report.title": "words for a report",
     "extract.encoder.encoder": "an encoder, which plug-ins may add",

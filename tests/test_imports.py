@@ -168,7 +168,6 @@ CLOSING = {
     "tacpipe.formats.xdf_restarts": {"tacpipe.formats.xdf_streams"},
     "tacpipe.formats.xdf_times": {"tacpipe.formats.xdf_streams"},
     "tacpipe.tasks.material.params": {"classifier", "network_training"},
-    "tacpipe.tasks.slip.params": {"network", "rule", "scorers", "training", "windows"},
     "tacpipe.tasks.touch.params": {"members", "predictor", "training"},
 }
 

@@ -18,6 +18,7 @@ from tests.fake_recordings import FakeDataset, FakeRecording, dataset
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
+from tests.tasks.slip.slip_recordings import trained
 from tests.tasks.slip.slip_recordings import trials as slips
 from tests.tasks.touch import handmade
 
@@ -37,11 +38,11 @@ def touch(folder: Path) -> Any:
 
 
 def slip(folder: Path) -> Any:
-    from tacpipe.tasks.slip import evaluation, training
-    from tacpipe.tasks.slip.params import Boosting
+    from tacpipe.tasks.slip import evaluation
+    from tacpipe.tasks.slip.params import SlipBoosting
 
-    params = Boosting(trees=10, leaves=4, leaf=10, learning_rate=0.3)
-    model = training.train(params, dataset(*slips(12)), None, folder)
+    params = SlipBoosting(trees=10, leaves=4, leaf=10, learning_rate=0.3)
+    model = trained(params, dataset(*slips(12)), None, folder)
     return evaluation.evaluate(model, dataset(*slips(8, 100)))
 
 

@@ -15,6 +15,7 @@ from tacpipe.tasks.learning.params import (
     BoostingEstimator,
     LearningParams,
     LinearEstimator,
+    NetworkEstimator,
     TreesEstimator,
 )
 
@@ -36,7 +37,7 @@ class ClassifyParams(LearningParams):
 class ClassifyAuto(AutoEstimator, ClassifyParams):
     """The estimator that cross-validation chooses."""
 
-    # auto: the simplest of linear, trees, boosting and the baselines within one standard error
+    # auto: the simplest of linear, trees and boosting within one standard error, or a baseline that is better
     architecture: Literal["auto"] = "auto"
 
 
@@ -76,6 +77,14 @@ class ClassifyMinirocket(ClassifyParams):
         from tacpipe.tasks.learning.estimators import FittedMinirocket
 
         return {"minirocket": lambda examples, outputs, part: FittedMinirocket.fit(examples, outputs, seed=self.seed)}
+
+
+@dataclass(frozen=True)
+class ClassifyNetwork(NetworkEstimator, ClassifyParams):
+    """A causal convolutional network."""
+
+    # network: a causal convolutional network on the windows
+    architecture: Literal["network"] = "network"
 
 
 Params = ClassifyParams  # params of any architecture

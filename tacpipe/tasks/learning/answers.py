@@ -17,7 +17,7 @@ from tacpipe.datasets.intervals import intervals_of
 from tacpipe.errors import UsageError
 from tacpipe.printable import listed
 from tacpipe.scores import calibration
-from tacpipe.tasks.learning.estimators import Kind
+from tacpipe.tasks.learning.features import Kind
 from tacpipe.tasks.learning.inputs import InputRows
 
 if TYPE_CHECKING:

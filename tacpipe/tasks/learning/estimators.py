@@ -8,18 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Protocol, cast, get_args
+from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats
 from tacpipe.models.boosting import BoostedTrees, TreeSizes
 from tacpipe.models.forest import Forest
-from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.tasks.learning.examples import Examples
-from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, FeatureKind, standardise
+from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, FeatureKind, Kind, standardise
 
-Kind = Literal["quantity", "class"]  # outputs are values, or scores of classes
+if TYPE_CHECKING:
+    from tacpipe.models.minirocket import MinirocketClassifier
+
 ALPHAS = tuple(10.0**power for power in range(-3, 6))  # penalties of ridge regression for standardised features
 PENALTY = 0.01  # L2 penalty of logistic regression, relative to the mean error of an example
 SMALLEST_PROBABILITY = 1e-4  # smallest probability of a class by trees
@@ -51,12 +52,13 @@ class FittedConstant:
     @classmethod
     def fit(cls, examples: Examples, outputs: Floats, kind: Kind, *, by_group: bool = False) -> FittedConstant:
         """Return the median of values, or the log of the frequencies of classes; with ``by_group`` also of each group."""
-        own_groups = np.array(examples.example_groups)
+        own_groups, weights = np.array(examples.example_groups), examples.training_weights
         groups = tuple(sorted(set(own_groups.tolist()))) if by_group else ()
-        parts = [outputs, *(outputs[own_groups == group] for group in groups)]
+        parts = [np.ones(len(outputs), bool), *(own_groups == group for group in groups)]
         if kind == "quantity":
-            return cls(np.stack([np.median(part, axis=0) for part in parts]), groups)
-        return cls(np.stack([_log_frequencies(part.mean(axis=0)) for part in parts]), groups)
+            return cls(np.stack([np.median(outputs[part], axis=0) for part in parts]), groups)
+        shares = [np.average(outputs[part], axis=0, weights=weights[part]) for part in parts]
+        return cls(np.stack([_log_frequencies(share) for share in shares]), groups)
 
     def outputs(self, examples: Examples) -> Floats:
         """Return the outputs (example, output)."""
@@ -109,11 +111,12 @@ class FittedLinear:
             return cls(features, means, deviations, np.atleast_2d(ridge.coef_), np.atleast_1d(ridge.intercept_))
         from sklearn.linear_model import LogisticRegression
 
-        labels = outputs.argmax(axis=1)
+        labels, example_weights = outputs.argmax(axis=1), examples.training_weights
         if len(np.unique(labels)) == 1:  # a fold of a class that one group has
             weights = np.zeros((outputs.shape[1], rows.shape[1]))
             return cls(features, means, deviations, weights, _log_frequencies(outputs.mean(axis=0)))
-        model = LogisticRegression(C=1 / (PENALTY * len(labels)), max_iter=1000).fit(standard, labels)
+        model = LogisticRegression(C=1 / (PENALTY * example_weights.sum()), max_iter=1000)
+        model.fit(standard, labels, sample_weight=example_weights)
         weights, base = np.zeros((outputs.shape[1], rows.shape[1])), np.full(outputs.shape[1], -np.inf)
         if len(model.classes_) == 2:  # scikit-learn fits only their difference
             signs = np.array([-0.5, 0.5])
@@ -207,6 +210,7 @@ class FittedBoosting:
         outputs: Floats,
         kind: Kind,
         *,
+        features: FeatureKind = "statistics",
         trees: int = 200,
         leaves: int = 31,
         leaf: int = 20,
@@ -215,21 +219,21 @@ class FittedBoosting:
         seed: int = 0,
     ) -> FittedBoosting:
         """Return trees of least absolute error, or of one class against the others."""
-        rows = examples.features("statistics")
+        rows = examples.features(features)
         rows = np.where(np.isnan(rows).all(axis=0), 0.0, rows)  # scikit-learn bins no column without values
         sizes = TreeSizes(trees, leaves, leaf, learning_rate, l2, seed)
         if kind == "quantity":
             grown = [BoostedTrees.fit_values(rows, column, sizes) for column in outputs.T]
         else:
             grown = []
-            ones = np.ones(len(rows))
+            weights = examples.training_weights
             for column in outputs.T[-1:] > 0.5 if outputs.shape[1] == 2 else outputs.T > 0.5:
                 if column.any() and not column.all():
-                    grown.append(BoostedTrees.fit(rows, column, ones, sizes))
+                    grown.append(BoostedTrees.fit(rows, column, weights, sizes))
                 else:
                     share = np.clip(column.mean(), SMALLEST_PROBABILITY, 1 - SMALLEST_PROBABILITY)
                     grown.append(BoostedTrees.constant(float(share)))
-        return cls("statistics", tuple(grown), kind == "class" and outputs.shape[1] == 2)
+        return cls(features, tuple(grown), kind == "class" and outputs.shape[1] == 2)
 
     def outputs(self, examples: Examples) -> Floats:
         """Return the outputs (example, output)."""
@@ -272,6 +276,8 @@ class FittedMinirocket:
     @classmethod
     def fit(cls, examples: Examples, outputs: Floats, *, seed: int = 0) -> FittedMinirocket:
         """Return the classifier of windows, whose streams must have equally many rows."""
+        from tacpipe.models.minirocket import MinirocketClassifier
+
         return cls(MinirocketClassifier.fit(_stacked(examples), outputs.argmax(axis=1), seed=seed))
 
     def outputs(self, examples: Examples) -> Floats:
@@ -289,10 +295,38 @@ class FittedMinirocket:
     @classmethod
     def load(cls, arrays: Mapping[str, AnyArray], described: Mapping[str, Any], outputs: int) -> FittedMinirocket:
         """Return the stored classifier. Raises `ValueError` if it has another number of classes."""
+        from tacpipe.models.minirocket import MinirocketClassifier
+
         classifier = MinirocketClassifier.from_tensors(arrays)
         if len(classifier.classes) != outputs:
             raise ValueError(f"a classifier of {len(classifier.classes)} classes for {outputs}")
         return cls(classifier)
+
+
+@dataclass(frozen=True)
+class ColumnsEstimator:
+    """An estimator that reads some columns of the features alone."""
+
+    columns: tuple[int, ...]
+    inner: FittedLinear | FittedBoosting
+
+    def outputs(self, examples: Examples) -> Floats:
+        """Return the outputs (example, output)."""
+        return self.inner.outputs(examples.with_columns(self.inner.features, self.columns))
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """Return the arrays of the estimator."""
+        return self.inner.arrays()
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the estimator states, and the columns."""
+        return {**self.inner.describe(), "columns": list(self.columns)}
+
+
+def _load_network(arrays: Mapping[str, AnyArray], described: Mapping[str, Any], outputs: int) -> OutputEstimator:
+    from tacpipe.tasks.learning.network import FittedNetwork
+
+    return FittedNetwork.load(arrays, described, outputs)
 
 
 ESTIMATORS: Mapping[str, Callable[[Mapping[str, AnyArray], Mapping[str, Any], int], OutputEstimator]] = {
@@ -301,12 +335,18 @@ ESTIMATORS: Mapping[str, Callable[[Mapping[str, AnyArray], Mapping[str, Any], in
     "trees": FittedTrees.load,
     "boosting": FittedBoosting.load,
     "minirocket": FittedMinirocket.load,
+    "network": _load_network,
 }
 
 
 def load(arrays: Mapping[str, AnyArray], described: Mapping[str, Any], outputs: int) -> OutputEstimator:
     """Return a stored estimator of so many outputs. Raises `ValueError` or `LookupError` if its parts do not fit."""
-    return ESTIMATORS[str(described["estimator"])](arrays, described, outputs)
+    estimator = ESTIMATORS[str(described["estimator"])](arrays, described, outputs)
+    if "columns" not in described:
+        return estimator
+    if not isinstance(estimator, FittedLinear | FittedBoosting):
+        raise ValueError(f"columns of a {described['estimator']}")
+    return ColumnsEstimator(tuple(map(int, described["columns"])), estimator)
 
 
 def _log_frequencies(frequencies: AnyFloats) -> Floats:

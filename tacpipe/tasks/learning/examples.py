@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Indices
 from tacpipe.errors import UsageError
-from tacpipe.tasks.learning.features import FeatureKind, window_features
+from tacpipe.tasks.learning.features import FeatureKind
 from tacpipe.tasks.learning.inputs import InputRows, Inputs
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ class Examples:
     values: Floats  # (example, target), the values to be answered; NaN if unknown
     # windows of each stream (example, time, channel); None: those of the rows
     stacked: Sequence[AnyFloats] | None = None
+    weights: Floats | None = None  # (example,), how much each counts in training; None: all alike
     _features: dict[FeatureKind, Floats] = field(default_factory=dict, compare=False)  # features computed so far
 
     def __len__(self) -> int:
@@ -41,6 +42,11 @@ class Examples:
     def example_groups(self) -> list[str]:
         """The group of each example."""
         return [self.groups[index] for index in self.owner.tolist()]
+
+    @property
+    def training_weights(self) -> Floats:
+        """How much each example counts in training (example,)."""
+        return np.ones(len(self)) if self.weights is None else self.weights
 
     @property
     def names(self) -> list[str]:
@@ -61,6 +67,7 @@ class Examples:
             rows=self.rows[chosen],
             values=self.values[chosen],
             stacked=None if self.stacked is None else [part[chosen] for part in self.stacked],
+            weights=None if self.weights is None else self.weights[chosen],
             _features={kind: values[chosen] for kind, values in self._features.items()},
         )
 
@@ -68,9 +75,7 @@ class Examples:
         """Return the windows (example, time, channel) of each stream."""
         if self.stacked is not None:
             return self.stacked
-        parts: list[AnyFloats] = []
-        for stream in self.inputs.streams:
-            parts.append(np.empty((len(self), stream.rows, len(stream.channels))))  # noqa: PERF401
+        parts = [np.empty((len(self), *shape)) for shape in self.inputs.window_shapes]
         for number in np.unique(self.owner).tolist():
             chosen = np.flatnonzero(self.owner == number)
             read = self.inputs.windows(self.recordings[number], self.rows[chosen])
@@ -82,6 +87,10 @@ class Examples:
         """Return the same examples with other windows (example, time, channel)."""
         return replace(self, stacked=windows, _features={})
 
+    def with_columns(self, kind: FeatureKind, columns: Sequence[int]) -> Examples:
+        """Return the same examples with some columns of their features alone."""
+        return replace(self, _features={kind: self.features(kind)[:, list(columns)]})
+
     def features(self, kind: FeatureKind) -> Floats:
         """Return the features (example, feature); ``time`` is the time since the start of the recording."""
         if kind not in self._features:
@@ -89,9 +98,8 @@ class Examples:
         return self._features[kind]
 
     def _window_features(self, kind: FeatureKind) -> Floats:
-        layouts = [stream.layout for stream in self.inputs.streams]
         blocks = [
-            window_features(kind, self.select(np.arange(first, min(first + BLOCK, len(self)))).windows(), layouts)
+            self.inputs.features(kind, self.select(np.arange(first, min(first + BLOCK, len(self)))).windows())
             for first in range(0, max(1, len(self)), BLOCK)
         ]
         return np.concatenate(blocks)
@@ -109,6 +117,11 @@ def join(inputs: Inputs, parts: Sequence[tuple[InputRows, str, Indices, Floats]]
         np.concatenate([np.zeros(0, np.intp), *(rows for _, _, rows, _ in parts)]),
         np.concatenate([np.zeros((0, width)), *(values for *_, values in parts)]),
     )
+
+
+def blank(inputs: Inputs) -> Examples:
+    """Return an example of zeros, by which a loaded model proves that it fits its inputs."""
+    return one_window(inputs, [np.zeros(shape) for shape in inputs.window_shapes], 0, 0)
 
 
 def one_window(inputs: Inputs, windows: Sequence[AnyFloats], t_ns: int, start_ns: int) -> Examples:

@@ -17,7 +17,7 @@ from tacpipe.arrays import AnyFloats, Floats, Indices
 CYCLES = (1, 2, 3, 5, 8, 12)  # cycles per window of the spectrum
 EPSILON = 1e-9  # minimum divisor
 PRESSED = 0.2  # fraction of the largest normal load of a finger above which a taxel counts as pressed
-Layout = Sequence[Mapping[str, str]]
+Layout = Sequence[Mapping[str, str]]  # taxel and axis of each channel, if its metadata contains them
 
 NAMES = (
     *(
@@ -160,6 +160,7 @@ def combine_streams(by_stream: Sequence[Floats]) -> Floats:
 SMALLEST_DEVIATION = 1e-12  # minimum divisor of features
 LARGEST = 10.0  # maximum standardised feature
 FeatureKind = Literal["last", "statistics", "time"]
+Kind = Literal["quantity", "class"]  # what is learned: values, or scores of classes
 PARTS = ("last", "mean", "deviation", "change", "least", "largest")  # features of each channel in a window
 
 

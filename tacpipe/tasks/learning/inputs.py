@@ -14,6 +14,7 @@ from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.rows import NO_WINDOW, RowCounts, count_rows
 from tacpipe.signals.runs import rows_in_windows
+from tacpipe.tasks.learning.features import FeatureKind, Layout, window_features
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
 
 MAX_ROWS = 100_000  # maximum number of rows of a window
-Layout = Sequence[Mapping[str, str]]  # taxel and axis of each channel, if its metadata contains them
 
 
 class StreamConfig(TypedDict):
@@ -198,9 +198,18 @@ class Inputs:
             )
         return recording.table(stored, names)
 
+    @property
+    def window_shapes(self) -> list[tuple[int, int]]:
+        """Rows and channels of each of `windows`."""
+        return [(stream.rows, len(stream.channels)) for stream in self.streams]
+
     def windows(self, rows: InputRows, ends: Indices) -> list[AnyFloats]:
         """Return the windows of each stream that end in rows (window, time, channel)."""
         return [rows.windows(ends, index, stream.rows) for index, stream in enumerate(self.streams)]
+
+    def features(self, kind: FeatureKind, windows: Sequence[AnyFloats]) -> Floats:
+        """Return the features (window, feature) of `windows`, as `window_features`."""
+        return window_features(kind, windows, [stream.layout for stream in self.streams])
 
 
 Chooser = Callable[[str, "pa.Schema"], Sequence[str]]  # name of a stored stream and its schema -> columns to read

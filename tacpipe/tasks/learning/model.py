@@ -13,19 +13,18 @@ from tacpipe.arrays import AnyFloats, Indices
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.errors import TacpipeError
-from tacpipe.models.tensors import tensors_under
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks import recordings as recordings_of
-from tacpipe.tasks.learning import estimators
 from tacpipe.tasks.learning import examples as examples_of
+from tacpipe.tasks.learning import storage
 from tacpipe.tasks.learning.answers import Classes, Quantities, answers_of
 from tacpipe.tasks.learning.estimators import OutputEstimator
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.inputs import InputRows, Inputs, InputStream
 from tacpipe.tasks.learning.params import LearnedConfig, LearningParams
-from tacpipe.tasks.learning.training import BASELINES, MODEL, read_examples
+from tacpipe.tasks.learning.training import read_examples
 from tacpipe.tasks.learning.uncertainty import ClassProbabilities, ErrorQuantiles, measure_uncertainty
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.task import CalibrationRequest, Files, quantiles_of
@@ -74,15 +73,7 @@ class LearnedModel:
                 uncertainty = ErrorQuantiles.from_config(config["calibration"], len(answers.targets))
             else:
                 uncertainty = ClassProbabilities.from_config(config["calibration"])
-            count = answers.output_count
-            baseline_arrays = model_files.arrays(files[BASELINES], BASELINES)
-            baselines = {
-                name: estimators.load(tensors_under(f"{name}.", baseline_arrays), described, count)
-                for name, described in config["baselines"].items()
-            }
-            arrays = model_files.arrays(files[MODEL], MODEL, but="chosen")  # an error that some readouts do not have
-            load = estimators.load if config["chosen"] in baselines else params.load_estimator
-            estimator = load(arrays, config["estimator"], count)
+            estimator, baselines = storage.from_files(files, config, params, inputs, answers.output_count)
         return cls(config, params, inputs, answers, estimator, baselines, uncertainty, chain)
 
     def rows(self, recordings: Sequence[Recording]) -> list[InputRows]:

@@ -16,35 +16,31 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tacpipe.plugins.constraints import Names, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, Unit
 from tacpipe.plugins.params import Panels
 from tacpipe.tasks.task import ModelConfig
+from tacpipe.training.schedule import Schedule
 
 if TYPE_CHECKING:
-    from tacpipe.arrays import AnyArray
+    from tacpipe.arrays import AnyArray, Floats
     from tacpipe.tasks.learning.estimators import OutputEstimator
+    from tacpipe.tasks.learning.examples import Examples
     from tacpipe.tasks.learning.inputs import StreamConfig
     from tacpipe.tasks.learning.selection import CandidateLoss, CurvePoint, Fit
 
 
-SIZES = ("trees", "leaf", "leaves", "learning_rate", "l2")  # params of the estimators
-SHARED_PANELS: Panels = {"Training": ("group", "curve", "stride", "seed"), "Data": ("inputs", "rest_s", "recentre")}
+SIZES = ("trees", "leaf", "leaves", "learning_rate", "l2", "channels", "layers")  # params of the estimators
+GRADIENT_CLIP = 1.0  # maximum norm of the gradient of a network
+SCHEDULE = ("epochs", "batch", "patience", "weight_decay")  # params of the training of networks
+SHARED_PANELS: Panels = {
+    "Training": ("group", "curve", "stride", *SCHEDULE, "seed"),
+    "Data": ("inputs", "rest_s", "recentre"),
+}
 
 
 @dataclass(frozen=True)
-class LearningParams(ABC):
-    """Params of all models of a label or a quantity."""
+class EstimatorParams(ABC):
+    """What all estimators of windows have in common."""
 
     KIND: ClassVar[Literal["quantity", "class"]]
     architecture: str = "auto"
-    inputs: Names = ""  # patterns of the columns to read, as taxel*; empty: all tactile columns
-    # time that the model looks back; without it 0.5 s for a column, and the whole recording for its label
-    context_s: Annotated[NonNegativeFloat, Unit("s")] | None = None
-    # duration at the start of a recording whose mean is the rest level; 0: values are read as they are
-    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.0
-    # label, as session, from each of whose values the median of all rows is subtracted; offline only; empty: none
-    recentre: str = ""
-    stride: PositiveInt = 1  # rows between two training windows
-    # labels whose recordings cross-validation leaves out together; empty: those of the split, else each recording
-    group: Names = ""
-    curve: bool = False  # also learn from parts of the training recordings, for a learning curve in the report
     seed: Seed = 0  # random seed
 
     @abstractmethod
@@ -63,8 +59,25 @@ class LearningParams(ABC):
         return estimators.load(arrays, described, outputs)
 
 
-class AutoEstimator(LearningParams):
-    """The simplest of linear, trees and boosting within one standard error, or a baseline if none is better."""
+@dataclass(frozen=True)
+class LearningParams(EstimatorParams):
+    """Params of all models of a label or a quantity."""
+
+    inputs: Names = ""  # patterns of the columns to read, as taxel*; empty: all tactile columns
+    # time that the model looks back; without it 0.5 s for a column, and the whole recording for its label
+    context_s: Annotated[NonNegativeFloat, Unit("s")] | None = None
+    # duration at the start of a recording whose mean is the rest level; 0: values are read as they are
+    rest_s: Annotated[NonNegativeFloat, Unit("s")] = 0.0
+    # label, as session, from each of whose values the median of all rows is subtracted; offline only; empty: none
+    recentre: str = ""
+    stride: PositiveInt = 1  # rows between two training windows
+    # labels whose recordings cross-validation leaves out together; empty: those of the split, else each recording
+    group: Names = ""
+    curve: bool = False  # also learn from parts of the training recordings, for a learning curve in the report
+
+
+class AutoEstimator(EstimatorParams):
+    """The simplest of linear, trees and boosting within one standard error, or a baseline that is better."""
 
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
         """Return the candidates with their default sizes."""
@@ -79,7 +92,7 @@ class AutoEstimator(LearningParams):
         }
 
 
-class LinearEstimator(LearningParams):
+class LinearEstimator(EstimatorParams):
     """Ridge regression, or logistic regression of classes, on features of the window."""
 
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
@@ -90,7 +103,7 @@ class LinearEstimator(LearningParams):
 
 
 @dataclass(frozen=True)
-class TreesEstimator(LearningParams):
+class TreesEstimator(EstimatorParams):
     """Extremely randomised trees on features of the window."""
 
     trees: PositiveInt = 100  # number of trees
@@ -108,7 +121,7 @@ class TreesEstimator(LearningParams):
 
 
 @dataclass(frozen=True)
-class BoostingEstimator(LearningParams):
+class BoostingEstimator(EstimatorParams):
     """Gradient-boosted trees on features of the window."""
 
     trees: PositiveInt = 200  # number of trees
@@ -134,6 +147,46 @@ class BoostingEstimator(LearningParams):
                 seed=self.seed,
             )
         }
+
+
+@dataclass(frozen=True)
+class NetworkEstimator(EstimatorParams):
+    """A causal convolutional network on the windows."""
+
+    channels: PositiveInt = 24  # channels of each layer
+    layers: Annotated[int, Range(1, 8)] = 4  # layers; each doubles the time between the rows that it combines
+    epochs: PositiveInt = 15  # maximum number of passes over the training windows
+    batch: PositiveInt = 128  # windows per step of the optimiser
+    learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
+    weight_decay: NonNegativeFloat = 1e-3  # fraction of each weight that is added to its gradient
+    patience: PositiveInt = 3  # epochs without a lower error on held-out training recordings before training stops
+
+    def candidates(self, workspace: Path) -> Mapping[str, Fit]:
+        """Return the network."""
+
+        def fit(examples: Examples, outputs: Floats, part: str) -> OutputEstimator:
+            from tacpipe.tasks.learning.network import FittedNetwork
+
+            schedule = Schedule(
+                epochs=self.epochs,
+                batch=self.batch,
+                learning_rate=self.learning_rate,
+                patience=self.patience,
+                gradient_clip=GRADIENT_CLIP,
+                seed=self.seed,
+            )
+            return FittedNetwork.fit(
+                examples,
+                outputs,
+                self.KIND,
+                schedule,
+                workspace / part,
+                channels=self.channels,
+                layers=self.layers,
+                weight_decay=self.weight_decay,
+            )
+
+        return {"network": fit}
 
 
 class LearnedConfig(ModelConfig):

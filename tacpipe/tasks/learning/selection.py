@@ -1,18 +1,18 @@
 """Choose an estimator by cross-validation within the training recordings: the simplest within one standard error.
 
-Groups of recordings are left out as a whole. Baselines take part, so that the chosen estimator is a baseline where no other
-is better.
+Groups of recordings are left out as a whole. Baselines take part: if no estimator is better than the best of them, it is
+chosen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Floats, Indices
+from tacpipe.arrays import Floats, Indices
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.tasks.learning.answers import ModelAnswers
@@ -23,6 +23,8 @@ FOLDS = 5
 FRACTIONS = (0.125, 0.25, 0.5, 1.0)  # fractions of the training groups of a learning curve
 # examples, their outputs, and the name of the part of the examples -> a fitted estimator
 Fit = Callable[[Examples, Floats, str], OutputEstimator]
+# outputs (example, output), their examples and the fold of each (example,) -> loss of each fold that has one (fold,)
+FoldLosses = Callable[[Floats, Examples, Indices], Floats]
 
 
 class CandidateLoss(TypedDict):
@@ -48,7 +50,12 @@ class Selection:
 
     name: str
     table: list[CandidateLoss]  # in the order of simplicity
-    outputs: Floats  # (example, output)
+    predicted: Mapping[str, Floats]  # outputs (example, output) of each candidate
+
+    @property
+    def outputs(self) -> Floats:
+        """The outputs of the chosen candidate (example, output)."""
+        return self.predicted[self.name]
 
 
 def assign_folds(examples: Examples, seed: int) -> Indices:
@@ -81,20 +88,26 @@ def out_of_fold(fit: Fit, examples: Examples, outputs: Floats, folds: Indices, n
 
 
 def select(
-    baselines: Mapping[str, Fit], candidates: Mapping[str, Fit], answers: ModelAnswers, examples: Examples, seed: int
+    baselines: Mapping[str, Fit],
+    candidates: Mapping[str, Fit],
+    outputs: Floats,
+    examples: Examples,
+    losses_of: FoldLosses,
+    seed: int,
 ) -> Selection:
-    """Return the simplest of baselines and candidates, in their order, within one standard error of the smallest loss.
+    """Return the first candidate within one standard error of the smallest loss that is better than every baseline.
 
-    The error is that of the difference of losses over folds.
+    The error is that of the difference of losses over folds. The best baseline is chosen if it is better than every
+    candidate. A single candidate is chosen whatever its loss.
     """
-    folds, outputs = assign_folds(examples, seed), answers.encode(examples.values)
+    folds = assign_folds(examples, seed)
     fits = {**baselines, **candidates}
     predicted = {}
     with terminal.progress_bar("cross-validate", len(fits)) as advance:
         for name, fit in fits.items():
             predicted[name] = out_of_fold(fit, examples, outputs, folds, name)
             advance(note=name)
-    losses = {name: _fold_means(answers.losses(values, examples.values), folds) for name, values in predicted.items()}
+    losses = {name: losses_of(values, examples, folds) for name, values in predicted.items()}
     best = min(losses, key=lambda name: float(losses[name].mean()))
     table: list[CandidateLoss] = []
     for name, by_fold in losses.items():
@@ -109,8 +122,39 @@ def select(
                 "error": _rounded(error),
             }
         )
-    chosen = next(row["name"] for row in table if row["excess"] <= row["error"])
-    return Selection(chosen, table, predicted[chosen])
+    return Selection(_chosen(table, list(candidates)), table, predicted)
+
+
+def _chosen(table: Sequence[CandidateLoss], candidates: Sequence[str]) -> str:
+    """Return the name of the candidate or baseline to use."""
+    if len(candidates) == 1:
+        return candidates[0]
+    baseline = min((row for row in table if row["baseline"]), key=lambda row: row["loss"], default=None)
+    better = [row for row in table if not row["baseline"] and (baseline is None or row["loss"] < baseline["loss"])]
+    if not better:
+        assert baseline is not None
+        return baseline["name"]
+    return next((row["name"] for row in better if row["excess"] <= row["error"]), better[0]["name"])
+
+
+def mean_losses(answers: ModelAnswers) -> FoldLosses:
+    """Return a function that returns the mean loss of each fold (fold,)."""
+
+    def measure(outputs: Floats, examples: Examples, folds: Indices) -> Floats:
+        losses = answers.losses(outputs, examples.values)
+        return np.array([losses[folds == fold].mean() for fold in np.unique(folds).tolist()])
+
+    return measure
+
+
+def notes(chosen: Selection, baselines: Mapping[str, Fit], groups: int) -> list[str]:
+    """Return a note if the chosen candidate is a baseline."""
+    if chosen.name not in baselines:
+        return []
+    return [
+        f"No estimator is better than the baseline {chosen.name.replace('_', ' ')} in cross-validation over {groups} "
+        f"groups, so the model is that baseline."
+    ]
 
 
 def learning_curve(fit: Fit, answers: ModelAnswers, examples: Examples, seed: int) -> list[CurvePoint]:
@@ -128,14 +172,9 @@ def learning_curve(fit: Fit, answers: ModelAnswers, examples: Examples, seed: in
             estimator = fit(examples.select(chosen), outputs[chosen], f"curve-{fraction:g}-{fold}")
             predicted[folds == fold] = estimator.outputs(examples.select(folds == fold))
             used.append(len(kept))
-        loss = _fold_means(answers.losses(predicted, examples.values), folds).mean()
+        loss = mean_losses(answers)(predicted, examples, folds).mean()
         points.append({"groups": float(np.mean(used)), "loss": _rounded(loss)})
     return points
-
-
-def _fold_means(losses: AnyFloats, folds: Indices) -> Floats:
-    """Return the mean loss of each fold (fold,)."""
-    return np.array([losses[folds == fold].mean() for fold in np.unique(folds).tolist()])
 
 
 def _rounded(value: float) -> float:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from safetensors.numpy import save
 
-from tacpipe.arrays import AnyArray
 from tacpipe.channels.schema import field_metadata, is_truth
 from tacpipe.codecs import tactile
-from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
@@ -21,19 +18,18 @@ from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW
 from tacpipe.printable import listed
 from tacpipe.tasks import recordings as recordings_of
 from tacpipe.tasks.learning import examples as examples_of
-from tacpipe.tasks.learning import selection
+from tacpipe.tasks.learning import selection, storage
 from tacpipe.tasks.learning.answers import Classes, ModelAnswers, Quantities, is_number
 from tacpipe.tasks.learning.estimators import FittedConstant, FittedLinear, FittedTrees
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.inputs import InputRows, Inputs, RawStream, find_inputs
-from tacpipe.tasks.learning.params import LearnedConfig, LearningParams
+from tacpipe.tasks.learning.params import LearningParams
 from tacpipe.tasks.learning.selection import Fit
 from tacpipe.tasks.learning.uncertainty import measure_uncertainty
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-MODEL, BASELINES = "estimator.safetensors", "baselines.safetensors"
 CONTEXT_S = 0.5  # default time that a model of a column looks back
 MAX_EXAMPLES = 50_000  # maximum number of training windows; more are thinned evenly
 NO_INPUTS = ("time", "mask", "label", "prediction", "sequence")  # quantities of columns that are no inputs
@@ -67,13 +63,14 @@ def train(
     answers = _require_learnable(answers, thinned)
     baselines = _baseline_fits(params, thinned, grouped=bool(group))
     candidates = params.candidates(workspace)
-    chosen = selection.select(baselines if len(candidates) > 1 else {}, candidates, answers, thinned, params.seed)
     outputs = answers.encode(thinned.values)
+    compared = baselines if len(candidates) > 1 else {}
+    chosen = selection.select(compared, candidates, outputs, thinned, selection.mean_losses(answers), params.seed)
     fits = {**baselines, **candidates}
     estimator = fits[chosen.name](thinned, outputs, "all")
     fitted_baselines = {name: fit(thinned, outputs, "all") for name, fit in baselines.items()}
     stored = params_of.to_json(params)
-    config: LearnedConfig = {
+    config = {
         "task": task,
         "architecture": stored["architecture"],
         "params": stored,
@@ -86,8 +83,6 @@ def train(
         "chosen_is_baseline": chosen.name in baselines,
         "candidates": chosen.table,
         "curve": selection.learning_curve(fits[chosen.name], answers, thinned, params.seed) if params.curve else [],
-        "estimator": estimator.describe(),
-        "baselines": {name: baseline.describe() for name, baseline in fitted_baselines.items()},
         "calibration": measure_uncertainty(answers, chosen.outputs, thinned.values).to_config(),
         "group": group,
         "counts": {
@@ -96,17 +91,10 @@ def train(
             "windows": len(thinned),
         },
     }
-    arrays = {
-        f"{name}.{part}": array
-        for name, baseline in fitted_baselines.items()
-        for part, array in baseline.arrays().items()
-    }
-    files = {
-        model_files.CONFIG: model_files.to_json(config),
-        MODEL: save(_contiguous(estimator.arrays())),
-        BASELINES: save(_contiguous(arrays)),
-    }
-    return files, _notes(config, len(examples))
+    notes = selection.notes(chosen, baselines, config["counts"]["groups"])
+    if len(examples) > MAX_EXAMPLES:
+        notes.append(f"Of {len(examples):,} windows, {MAX_EXAMPLES:,} were learned from, evenly spaced. Set --stride.")
+    return storage.to_files(config, estimator, fitted_baselines), notes
 
 
 def read_examples(
@@ -212,20 +200,3 @@ def _baseline_fits(params: LearningParams, examples: Examples, *, grouped: bool)
     if any(stream.rows > 1 for stream in examples.inputs.streams):
         fits["last_row"] = lambda part, outputs, name: FittedLinear.fit(part, outputs, kind, features="last")
     return fits
-
-
-def _contiguous(arrays: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-
-
-def _notes(config: LearnedConfig, available: int) -> list[str]:
-    """Return notes on the choice of the estimator, and on windows that were left out."""
-    notes = []
-    if config["chosen_is_baseline"]:
-        notes.append(
-            f"No estimator is better than the baseline {config['chosen'].replace('_', ' ')} in cross-validation over "
-            f"{config['counts']['groups']} groups, so the model is that baseline."
-        )
-    if available > MAX_EXAMPLES:
-        notes.append(f"Of {available:,} windows, {MAX_EXAMPLES:,} were learned from, evenly spaced. Set --stride.")
-    return notes

@@ -14,6 +14,7 @@ from tacpipe.tasks.learning.params import (
     BoostingEstimator,
     LearningParams,
     LinearEstimator,
+    NetworkEstimator,
     TreesEstimator,
 )
 
@@ -33,7 +34,7 @@ class RegressParams(LearningParams):
 class RegressAuto(AutoEstimator, RegressParams):
     """The estimator that cross-validation chooses."""
 
-    # auto: the simplest of linear, trees, boosting and the baselines within one standard error
+    # auto: the simplest of linear, trees and boosting within one standard error, or a baseline that is better
     architecture: Literal["auto"] = "auto"
 
 
@@ -59,6 +60,14 @@ class RegressBoosting(BoostingEstimator, RegressParams):
 
     # boosting: gradient-boosted trees of least absolute error
     architecture: Literal["boosting"] = "boosting"
+
+
+@dataclass(frozen=True)
+class RegressNetwork(NetworkEstimator, RegressParams):
+    """A causal convolutional network."""
+
+    # network: a causal convolutional network on the windows
+    architecture: Literal["network"] = "network"
 
 
 Params = RegressParams  # params of any architecture

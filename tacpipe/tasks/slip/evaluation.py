@@ -18,13 +18,13 @@ from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.scores import headline, pairing
 from tacpipe.scores.pairing import Sums
+from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
 from tacpipe.tasks.slip.metrics import PARTS, QUESTIONS, AreaLayout, WindowScores
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.scorers import CONSTANT, score_baselines
-from tacpipe.tasks.slip.training import TASK, labelled_tracks, score_windows, scored_tracks
-from tacpipe.tasks.slip.windows import STABLE, TrainingWindows, read_windows
+from tacpipe.tasks.slip.training import TASK, labelled_tracks, scored_tracks, scores_of
+from tacpipe.tasks.slip.windows import STABLE, read_examples
 
 MODEL = "model"
 WINDOWS, EVENTS = "windows", "events.json"
@@ -40,16 +40,13 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
             "No recording has labels of slips, except those that the model was trained on. Give recordings with the role "
             "test, with labels."
         )
-    windows = read_windows(model.reader, tracks, model.params)
-    scores = {MODEL: score_windows(model.scorer, windows), **score_baselines(model.baselines, windows.features)}
-    base_rate = float(model.config["base_rate"])
-    probabilities = {
-        MODEL: model.calibration.probability(scores[MODEL]),
-        **{name: 1 / (1 + np.exp(-values)) for name, values in scores.items() if name not in (MODEL, CONSTANT)},
-        CONSTANT: np.full(len(windows), base_rate),
-    }
+    examples = read_examples(model.reader, tracks, model.params)
+    outputs = {name: baseline.outputs(examples) for name, baseline in model.baselines.items()}
+    scores = {MODEL: model.scores(examples), **{name: scores_of(values) for name, values in outputs.items()}}
+    probabilities = {name: 1 / (1 + np.exp(-values)) for name, values in scores.items()}
+    probabilities[MODEL] = model.calibration.probability(scores[MODEL])
     levels = {MODEL: model.calibration.levels, **model.config["baseline_levels"]}
-    evaluated = EvaluatedSlips.from_windows(windows, scores, probabilities, levels)
+    evaluated = EvaluatedSlips.from_examples(examples, scores, probabilities, levels)
     architecture = str(model.config["architecture"])
     origin = combine_origins(recordings.recordings[track.name].attributes for track in evaluated.tracks)
     return Result(
@@ -79,18 +76,18 @@ class EvaluatedSlips:
     ] = ()  # recording -> its fold, if there are several; scores of different folds are not compared
 
     @classmethod
-    def from_windows(
+    def from_examples(
         cls,
-        windows: TrainingWindows,
+        examples: Examples,
         scores: Mapping[str, Floats],
         probabilities: Mapping[str, Floats],
         levels: Mapping[str, Mapping[str, float]],
     ) -> EvaluatedSlips:
         """Return the evaluation of windows, by the scores and probabilities (window,) of each predictor."""
-        tracks = tuple(scored_tracks(windows, scores[MODEL]))
+        tracks = tuple(scored_tracks(examples, scores[MODEL]))
 
         def split_by_track(values: Mapping[str, Floats]) -> dict[str, tuple[Floats, ...]]:
-            masks = [windows.track == index for index in range(len(tracks))]
+            masks = [examples.owner == index for index in range(len(tracks))]
             return {name: tuple(column[mask] for mask in masks) for name, column in values.items()}
 
         return cls(

@@ -17,24 +17,27 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks import recordings as recordings_of
+from tacpipe.tasks.learning import examples as examples_of
+from tacpipe.tasks.learning import storage
+from tacpipe.tasks.learning.estimators import ColumnsEstimator, FittedLinear, OutputEstimator
+from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.inputs import InputStream
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
 from tacpipe.tasks.slip.calibration import SlipCalibration
-from tacpipe.tasks.slip.params import SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.scorers import BEST_FEATURE, LinearScorer, Scorer, load_baseline
-from tacpipe.tasks.slip.training import BASELINES, MODEL, labelled_tracks, score_windows, scored_tracks
-from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, read_windows
+from tacpipe.tasks.slip.params import SlipConfig, SlipParams
+from tacpipe.tasks.slip.training import BEST_FEATURE, labelled_tracks, scored_tracks, scores_of
+from tacpipe.tasks.slip.windows import FingerReader, GraspTrack, are_slips, read_examples
 from tacpipe.tasks.task import CalibrationRequest, Files
 
 NEEDED: Mapping[str, model_files.Kind] = {
-    "fingers": list,
-    "rate_hz": (int, float),
+    "inputs": list,
     "calibration.scores": list,
     "calibration.probabilities": list,
     "calibration.levels": dict,
-    "scorer": dict,
+    "chosen": str,
+    "estimator": dict,
+    "baselines": dict,
     "baseline_levels": dict,
-    "base_rate": (int, float),
     "params": dict,
     "trained_on": dict,
 }
@@ -45,10 +48,10 @@ class SlipModel:
     """A loaded slip model."""
 
     config: SlipConfig
-    params: SlipModelParams
+    params: SlipParams
     reader: FingerReader
-    scorer: Scorer
-    baselines: Mapping[str, Scorer]
+    estimator: OutputEstimator
+    baselines: Mapping[str, OutputEstimator]
     calibration: SlipCalibration
     chain: OpenedChain | None = None
 
@@ -58,15 +61,13 @@ class SlipModel:
         config = model_files.tree(files, model_files.CONFIG, NEEDED)
         with model_files.validated("the model"):
             params = params_of.from_json(registry.load("train.slip"), config["params"])
-            fingers = tuple(InputStream.from_config(finger) for finger in config["fingers"])
-            if not fingers:
-                raise ValueError("the model reads no finger")
-            reader = FingerReader(fingers, round(params.rest_s * 1e9), params.reads_plans)
-            arrays = model_files.arrays(files[MODEL], MODEL)
-            scorer = params.load_scorer(arrays, config["scorer"], reader)
-            baselines = _load_baselines(files, reader)
+            streams = tuple(InputStream.from_config(stream) for stream in config["inputs"])
+            if not streams:
+                raise ValueError("the model reads no stream")
+            reader = FingerReader(streams, round(params.rest_s * 1e9), params.reads_plans)
+            estimator, baselines = storage.from_files(files, config, params, reader, 2)
             calibration = SlipCalibration.from_config(config["calibration"])
-        return cls(config, params, reader, scorer, baselines, calibration, chain)
+        return cls(config, params, reader, estimator, baselines, calibration, chain)
 
     @property
     def horizon_ns(self) -> int:
@@ -74,11 +75,12 @@ class SlipModel:
         return round(self.params.horizon_s * 1e9)
 
     def notes(self) -> list[str]:
-        """Return a note on the feature of the baseline `BEST_FEATURE`; an empty list for models without this baseline."""
-        scorer = self.baselines.get(BEST_FEATURE)
-        if not isinstance(scorer, LinearScorer):
+        """Return a note on the feature of the baseline `BEST_FEATURE`."""
+        baseline = self.baselines[BEST_FEATURE]
+        if not isinstance(baseline, ColumnsEstimator) or not isinstance(baseline.inner, FittedLinear):
             return []
-        name, direction = self.reader.names[scorer.columns[0]], "larger" if scorer.weights[0] > 0 else "smaller"
+        weights = baseline.inner.weights[:, 0]
+        name, direction = self.reader.names[baseline.columns[0]], "larger" if weights[1] > weights[0] else "smaller"
         return [f"The baseline {BEST_FEATURE.replace('_', ' ')} is {name}, {direction} before slips."]
 
     def predict(self, recordings: Dataset | Recording) -> dict[str, pa.Table] | pa.Table:
@@ -96,7 +98,11 @@ class SlipModel:
         track = self.reader.track(recording)
         rows = np.flatnonzero(track.ready)
         self.reader.count_rows(track, rows)
-        return self.to_table(track, rows, self.scorer.score(self.reader, track, rows))
+        return self.to_table(track, rows, self.scores(examples_of.unlabelled(self.reader, track, [], rows)))
+
+    def scores(self, examples: Examples) -> Floats:
+        """Return the scores of windows (window,)."""
+        return scores_of(self.estimator.outputs(examples))
 
     def to_table(self, track: GraspTrack, rows: Indices, scores: Floats) -> pa.Table:
         """Return the table of rows of a track with these scores (row,)."""
@@ -122,17 +128,6 @@ class SlipModel:
         return pa.Table.from_arrays(list(columns.values()), schema=pa.schema(fields))
 
 
-def _load_baselines(files: Mapping[str, bytes], reader: FingerReader) -> dict[str, Scorer]:
-    """Return the baselines by name."""
-    described = model_files.tree(files, model_files.CONFIG, {"baselines": dict})["baselines"]
-    arrays = model_files.arrays(files[BASELINES], BASELINES)
-    baselines: dict[str, Scorer] = {}
-    for name, own_config in described.items():
-        own = {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
-        baselines[name] = load_baseline(name, own, own_config, reader)
-    return baselines
-
-
 def predict(files: Mapping[str, bytes], recordings: Dataset) -> Result:
     """Return one table of predictions per recording. Raises `TacpipeError` if a recording lacks inputs of the model."""
     model = SlipModel.load(files)
@@ -150,15 +145,19 @@ def calibrate(
     """
     model = SlipModel.load(files)
     tracks = labelled_tracks(model.reader, validation)
-    windows = read_windows(model.reader, tracks, model.params)
-    if not len(windows) or not windows.slips.any():
+    examples = read_examples(model.reader, tracks, model.params)
+    if not are_slips(examples).any():
         raise TacpipeError(
             "The calibration recordings have no slip. Make a split with some: `tacpipe split --calibration 0.2`."
         )
-    scores = score_windows(model.scorer, windows)
-    tracks_with_scores = scored_tracks(windows, scores)
+    scores = model.scores(examples)
     calibration = SlipCalibration.fit(
-        scores, windows.slips, windows.weights, tracks_with_scores, "calibration recordings", model.horizon_ns
+        scores,
+        are_slips(examples),
+        examples.training_weights,
+        scored_tracks(examples, scores),
+        "calibration recordings",
+        model.horizon_ns,
     )
     config = dict(model.config)
     config["calibration"] = calibration.to_config()

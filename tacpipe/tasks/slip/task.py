@@ -64,18 +64,20 @@ class SlipTask(Task):
     requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=4, reads=("object", "slip_intervals"))
+    @stage(version=5, reads=("object", "slip_intervals"))
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 
         The model reads the last second of all tactile streams, optionally also the planned motion, and returns the
-        probability that the object slips within the next second. Alarm levels are set on validation recordings.
+        probability that the object slips within the next second. By default, cross-validation over objects chooses the
+        estimator, and a baseline if no estimator is better. Alarm levels are set on validation recordings.
 
         Example: tacpipe train slip data/slips --split data/split -o models/slip
         """
         from tacpipe.tasks.slip import training
 
-        return Result(files=training.train(params, train, val, workspace))
+        files, notes = training.train(params, train, val, workspace)
+        return Result(files=files, notes=notes)
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
         """Return areas under the curve, Brier scores and alarms; raises as `tacpipe.tasks.slip.evaluation`."""

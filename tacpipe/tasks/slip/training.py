@@ -1,66 +1,52 @@
-"""Train a slip model: its scorer, the baselines, the calibration and the alarm levels."""
+"""Train a slip model: choose its estimator, fit it and its baselines, and set probabilities and alarm levels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from safetensors.numpy import save
 
-from tacpipe.arrays import AnyArray, Floats
-from tacpipe.datasets import model_files
+from tacpipe.arrays import AnyFloats, Floats, Indices
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks import recordings
+from tacpipe.tasks.learning import selection, storage
+from tacpipe.tasks.learning.estimators import (
+    ColumnsEstimator,
+    FittedBoosting,
+    FittedConstant,
+    FittedLinear,
+    OutputEstimator,
+)
+from tacpipe.tasks.learning.examples import Examples
+from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, FeatureKind, Kind, standardise
+from tacpipe.tasks.learning.selection import Fit
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
-from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule, SlipConfig, SlipModelParams
-from tacpipe.tasks.slip.rule import RuleScorer
-from tacpipe.tasks.slip.scorers import BoostedScorer, Scorer, baseline_fits
+from tacpipe.tasks.slip.params import SlipParams
+from tacpipe.tasks.slip.planned import NAMES_OF_PLAN
 from tacpipe.tasks.slip.windows import (
+    BEFORE,
+    DURING,
+    STABLE,
     FingerReader,
     GraspTrack,
-    TrainingWindows,
+    are_slips,
+    read_examples,
     read_training,
-    read_windows,
     shuffle_labels,
 )
 
 TASK = "slip"
-MODEL, BASELINES = "scorer.safetensors", "baselines.safetensors"
-BASELINE = Boosting(trees=60, leaves=6)  # size of the baselines that read few columns
-FOLDS = 5  # folds of out-of-fold scores
+CONSTANT, BEST_FEATURE = "constant", "best_feature"  # names of baselines
 
 
-@dataclass(frozen=True)
-class SlipTraining:
-    """Windows for the ``fit`` of an architecture, and the training methods that the task offers."""
-
-    windows: TrainingWindows
-    workspace: Path  # folder for checkpoints, so that training can resume
-
-    def boost(self, params: Boosting) -> Scorer:
-        """Return boosted trees on all features."""
-        return BoostedScorer.fit(self.windows, params)
-
-    def train_network(self, params: ConvolutionParams) -> Scorer:
-        """Return a network that the shared loop trained."""
-        from tacpipe.tasks.slip.network import ConvolutionScorer
-
-        return ConvolutionScorer.fit(self.windows, params, self.workspace)
-
-    def apply_rule(self, params: ForecastRule) -> Scorer:
-        """Return the rule on forecasts, which learns nothing."""
-        return RuleScorer(params.forward_model, params.forward_digest)
-
-
-Fit = Callable[[TrainingWindows, str], Scorer]  # windows and the name of a part of them -> scorer
-
-
-def train(params: SlipModelParams, training: Dataset, validation: Dataset | None, workspace: Path) -> dict[str, bytes]:
-    """Return the files of a model trained on the recordings of ``training``.
+def train(
+    params: SlipParams, training: Dataset, validation: Dataset | None, workspace: Path
+) -> tuple[dict[str, bytes], list[str]]:
+    """Return the files of a model trained on the recordings of ``training``, and notes for the user.
 
     Validation recordings are used for the calibration and the alarm levels only. Raises `TacpipeError` if no training
     recording has slip labels, or none has a slip.
@@ -68,45 +54,45 @@ def train(params: SlipModelParams, training: Dataset, validation: Dataset | None
     reader, tracks = read_training(training, params)
     if params.labels == "shuffled":
         tracks = shuffle_labels(tracks, params.seed)
-    windows = read_windows(reader, tracks, params, params.stride)
-    _require_both(windows, len(training.recordings), len(tracks))
-    scorer = params.fit(SlipTraining(windows, workspace / "scorer"))
+    examples = read_examples(reader, tracks, params, params.stride)
+    _require_both(examples, params, len(training.recordings), len(tracks))
     held_out = labelled_tracks(reader, validation) if validation is not None else []
-    calibration = calibrate_scorer(scorer, _fit_params(params, workspace), windows, held_out)
-    baselines, levels = {}, {}
-    for name, fit in baseline_fits(reader, BASELINE).items():
-        baselines[name] = fit(windows, "")
-        levels[name] = calibrate_scorer(baselines[name], fit, windows, held_out).to_config()["levels"]
-    counts = {
-        "recordings": len(tracks),
-        "windows": len(windows),
-        "slips": sum(len(track.events) for track in tracks),
-        "val": len(held_out),
+    outputs = np.stack([~are_slips(examples), are_slips(examples)], axis=1).astype(np.float64)
+    baselines = baseline_fits(reader, examples)
+    candidates = {name: _of_counted(fit) for name, fit in params.candidates(workspace).items()}
+    chosen = selection.select(baselines, candidates, outputs, examples, area_losses, params.seed)
+    estimators = {
+        name: fit(examples, outputs, "all")
+        for name, fit in {**baselines, **candidates}.items()
+        if name in baselines or name == chosen.name
+    }
+    calibrations = {
+        name: calibrate_scores(estimator, scores_of(chosen.predicted[name]), examples, held_out, params)
+        for name, estimator in estimators.items()
     }
     stored = params_of.to_json(params)
-    config: SlipConfig = {
+    objects = sorted({track.object for track in tracks})
+    config = {
         "task": TASK,
         "architecture": stored["architecture"],
         "params": stored,
         "trained_on": recordings.trained_on_datasets(training, *([validation] if validation is not None else [])),
-        "fingers": [finger.to_config() for finger in reader.streams],
-        "rate_hz": reader.streams[0].rate_hz,
-        "objects": sorted({track.object for track in tracks}),
-        "counts": counts,
-        "calibration": calibration.to_config(),
-        "scorer": scorer.describe(),
-        "baselines": {name: baseline.describe() for name, baseline in baselines.items()},
-        "baseline_levels": levels,
-        "base_rate": float(f"{np.average(windows.slips, weights=windows.weights):.9g}"),
+        "inputs": [stream.to_config() for stream in reader.streams],
+        "objects": objects,
+        "counts": {
+            "recordings": len(tracks),
+            "windows": len(examples),
+            "slips": sum(len(track.events) for track in tracks),
+            "val": len(held_out),
+        },
+        "chosen": chosen.name,
+        "chosen_is_baseline": chosen.name in baselines,
+        "candidates": chosen.table,
+        "calibration": calibrations[chosen.name].to_config(),
+        "baseline_levels": {name: calibrations[name].to_config()["levels"] for name in baselines},
     }
-    baseline_arrays: dict[str, AnyArray] = {}
-    for name, baseline in baselines.items():
-        baseline_arrays |= {f"{name}.{part}": array for part, array in baseline.arrays().items()}
-    return {
-        model_files.CONFIG: model_files.to_json(config),
-        MODEL: save(scorer.arrays()),
-        BASELINES: save(baseline_arrays),
-    }
+    files = storage.to_files(config, estimators[chosen.name], {name: estimators[name] for name in baselines})
+    return files, selection.notes(chosen, baselines, len(objects))
 
 
 def labelled_tracks(reader: FingerReader, dataset: Dataset) -> list[GraspTrack]:
@@ -115,95 +101,151 @@ def labelled_tracks(reader: FingerReader, dataset: Dataset) -> list[GraspTrack]:
     return [track for track in tracks if track.labels is not None]
 
 
-def calibrate_scorer(
-    scorer: Scorer, fit: Fit, windows: TrainingWindows, held_out: Sequence[GraspTrack]
-) -> SlipCalibration:
-    """Return the calibration of a scorer by out-of-fold scores of its training windows, and by validation recordings.
+def scores_of(outputs: Floats) -> Floats:
+    """Return the log odds of a slip (window,) of outputs (window, class)."""
+    return np.asarray(outputs[:, 1] - outputs[:, 0])
 
-    ``fit`` trains a scorer of the same kind on a part of the windows. Alarm levels are set on validation recordings;
-    without any, on the out-of-fold scores.
+
+def areas(scores: AnyFloats, examples: Examples) -> list[float]:
+    """Return the weighted areas under the curve of windows before and during slips against stable contact.
+
+    A kind without windows on both sides is left out.
     """
-    params = windows.params
-    horizon_ns = round(params.horizon_s * 1e9)
-    scores = out_of_fold(windows, fit)
-    parts = [(scores, windows.slips, windows.weights)]
+    from sklearn.metrics import roc_auc_score
+
+    states, weights = examples.values[:, 0], examples.training_weights
+    found = []
+    for kind in (BEFORE, DURING):
+        counted = (weights > 0) & ((states == kind) | (states == STABLE))
+        slips = states[counted] == kind
+        if slips.any() and not slips.all():
+            found.append(float(roc_auc_score(slips, scores[counted], sample_weight=weights[counted])))
+    return found
+
+
+def area_losses(outputs: Floats, examples: Examples, folds: Indices) -> Floats:
+    """Return 1 minus the mean of `areas` of each fold that has some (fold,); 1 if none has."""
+    scores = scores_of(outputs)
+    by_fold = [areas(scores[folds == fold], examples.select(folds == fold)) for fold in np.unique(folds).tolist()]
+    return np.array([1 - float(np.mean(found)) for found in by_fold if found] or [1.0])
+
+
+def baseline_fits(reader: FingerReader, examples: Examples) -> dict[str, Fit]:
+    """Return the baselines in the order of simplicity: a constant, the time, the best single feature, and the plan."""
+    planned = [reader.names.index(name) for name in NAMES_OF_PLAN] if reader.reads_plans else []
+    fits: dict[str, Fit] = {
+        CONSTANT: lambda part, outputs, name: FittedConstant.fit(part, outputs, "class"),
+        "time_only": lambda part, outputs, name: _small_trees(part, outputs, "class", features="time"),
+        BEST_FEATURE: lambda part, outputs, name: fit_columns(FittedLinear.fit, part, outputs, [best_column(part)]),
+    }
+    if planned:
+        fits["planned_motion"] = lambda part, outputs, name: fit_columns(_small_trees, part, outputs, planned)
+    return {name: _of_counted(fit) for name, fit in fits.items()}
+
+
+def _small_trees(
+    examples: Examples, outputs: Floats, kind: Kind, features: FeatureKind = "statistics"
+) -> FittedBoosting:
+    """Return the boosted trees of baselines that read few columns."""
+    return FittedBoosting.fit(
+        examples, outputs, kind, features=features, trees=60, leaves=6, leaf=200, learning_rate=0.08, l2=50.0
+    )
+
+
+def fit_columns(
+    fit: Callable[[Examples, Floats, Kind], FittedLinear | FittedBoosting],
+    examples: Examples,
+    outputs: Floats,
+    columns: Sequence[int],
+) -> ColumnsEstimator:
+    """Return an estimator that reads some columns of the features."""
+    return ColumnsEstimator(tuple(columns), fit(examples.with_columns("statistics", columns), outputs, "class"))
+
+
+def best_column(examples: Examples) -> int:
+    """Return the feature that best separates windows with a slip from others, without training.
+
+    It has the largest mean of `areas`, of its values or of their negatives: whichever are larger on average in windows
+    with a slip. A regression on this column has the same direction.
+    """
+    features, slips, weights = examples.features("statistics"), are_slips(examples), examples.training_weights
+    if not (weights[slips].any() and weights[~slips].any()):
+        return 0
+    found = {}
+    for column, values in enumerate(features.T):
+        finite = values[np.isfinite(values)]
+        if len(finite) and finite.min() < finite.max():
+            standard = standardise(values, finite.mean(), max(finite.std(), SMALLEST_DEVIATION))
+            slipping, stable = (np.average(standard[part], weights=weights[part]) for part in (slips, ~slips))
+            found[column] = float(np.mean(areas(np.sign(slipping - stable) * standard, examples)))
+    return max(found, key=lambda column: found[column], default=0)
+
+
+def calibrate_scores(
+    estimator: OutputEstimator, scores: Floats, examples: Examples, held_out: Sequence[GraspTrack], params: SlipParams
+) -> SlipCalibration:
+    """Return the calibration of an estimator by out-of-fold ``scores`` (window,) of its training windows.
+
+    Alarm levels are set on validation recordings, whose scores also count; without any, on the out-of-fold scores.
+    """
+    parts = [(scores, are_slips(examples), examples.training_weights)]
+    tracks = scored_tracks(examples, scores)
     if held_out:
-        validation = read_windows(windows.reader, held_out, params)
-        validation_scores = score_windows(scorer, validation)
-        parts.append((validation_scores, validation.slips, validation.weights))
-        tracks = scored_tracks(validation, validation_scores)
-    else:
-        tracks = scored_tracks(windows, scores)
+        assert isinstance(examples.inputs, FingerReader)
+        validation = read_examples(examples.inputs, held_out, params)
+        found = scores_of(estimator.outputs(validation))
+        parts.append((found, are_slips(validation), validation.training_weights))
+        tracks = scored_tracks(validation, found)
     method = "out-of-fold training recordings" + (" and validation recordings" if held_out else "")
     all_scores, slips, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return SlipCalibration.fit(all_scores, slips, weights, tracks, method, horizon_ns)
+    return SlipCalibration.fit(all_scores, slips, weights, tracks, method, round(params.horizon_s * 1e9))
 
 
-def scored_tracks(windows: TrainingWindows, scores: Floats) -> list[ScoredTrack]:
-    """Return the counted rows of the windows' tracks with their scores (window,)."""
-    params = windows.params
-    horizon_ns, recovery_ns = round(params.horizon_s * 1e9), round(params.recovery_s * 1e9)
+def scored_tracks(examples: Examples, scores: Floats) -> list[ScoredTrack]:
+    """Return the counted rows of the recordings of windows, with their scores (window,)."""
     scored = []
-    for number, track in enumerate(windows.tracks):
-        chosen = windows.track == number
-        rows = windows.rows[chosen]
+    for number, track in enumerate(examples.recordings):
+        assert isinstance(track, GraspTrack)
+        chosen = examples.owner == number
+        rows = examples.rows[chosen]
         scored.append(
             ScoredTrack(
                 track.name,
                 track.object,
                 track.t_ns[rows],
-                track.states(horizon_ns, recovery_ns)[rows],
+                examples.values[chosen, 0].astype(np.int64),
                 scores[chosen],
                 track.events,
-                windows.weights[chosen],
+                examples.training_weights[chosen],
                 track.since_s[rows],
             )
         )
     return scored
 
 
-def score_windows(scorer: Scorer, windows: TrainingWindows) -> Floats:
-    """Return the scores of windows (window,)."""
-    scores = scorer.score_features(windows.features)
-    if scores is not None:
-        return scores
-    parts = [np.zeros(0)]
-    for number, track in enumerate(windows.tracks):
-        parts.append(scorer.score(windows.reader, track, windows.rows[windows.track == number]))
-    return np.concatenate(parts)
+def _of_counted(fit: Fit) -> Fit:
+    """Return a function that fits the windows that have a weight alone, and a constant where none has one."""
+
+    def fit_counted(examples: Examples, outputs: Floats, part: str) -> OutputEstimator:
+        counted = examples.training_weights > 0
+        if not counted.any():
+            return FittedConstant.fit(replace(examples, weights=None), outputs, "class")
+        return fit(examples.select(counted), outputs[counted], part)
+
+    return fit_counted
 
 
-def out_of_fold(windows: TrainingWindows, fit: Fit) -> Floats:
-    """Return the score of each training window by a scorer that was trained without its object (window,).
-
-    A fold whose other objects lack slips or stable contact is scored by a scorer of all windows.
-    """
-    groups = windows.groups
-    objects = int(groups.max()) + 1
-    fold = np.random.default_rng(windows.params.seed).permutation(objects)[groups] % FOLDS
-    scores = np.full(len(windows), np.nan)
-    for number in np.unique(fold).tolist():
-        remaining = windows.select(fold != number)
-        is_possible = bool(remaining.slips.any() and not remaining.slips.all())
-        scorer = fit(remaining if is_possible else windows, f"fold-{number}")
-        scores[fold == number] = score_windows(scorer, windows.select(fold == number))
-    return scores
-
-
-def _fit_params(params: SlipModelParams, workspace: Path) -> Fit:
-    return lambda part, name: params.fit(SlipTraining(part, workspace / name))
-
-
-def _require_both(windows: TrainingWindows, recordings_read: int, labelled: int) -> None:
+def _require_both(examples: Examples, params: SlipParams, recordings_read: int, labelled: int) -> None:
     """Raise `TacpipeError` unless there are windows with and without a slip."""
     if not labelled:
         raise TacpipeError(
             f"None of {recordings_read} training recordings has labels of slips. Run `tacpipe segment slips`, `tacpipe "
             f"segment losses` or `tacpipe label RECORDINGS --interval slip FROM TO`."
         )
-    if not windows.slips.any() or windows.slips.all():
-        kind = "a slip" if not windows.slips.any() else "stable contact"
+    slips = are_slips(examples)
+    if not slips.any() or slips.all():
+        kind = "a slip" if not slips.any() else "stable contact"
         raise TacpipeError(
             f"The {labelled} labelled training recordings have no window with {kind}. Give recordings with slips and with "
-            f"stable contact, longer than {windows.params.window_s:g} s."
+            f"stable contact, longer than {params.window_s:g} s."
         )

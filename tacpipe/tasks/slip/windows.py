@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
@@ -15,12 +15,21 @@ from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW
 from tacpipe.sensors.plan import NAME as PLAN
-from tacpipe.tasks.learning.features import ChannelAxes, combine_streams, feature_names, stream_features
+from tacpipe.tasks.learning.examples import Examples, join
+from tacpipe.tasks.learning.features import (
+    ChannelAxes,
+    FeatureKind,
+    combine_streams,
+    feature_names,
+    stream_features,
+)
 from tacpipe.tasks.learning.inputs import InputRows, Inputs, find_inputs
 from tacpipe.tasks.slip.labels import SlipLabels, read_labels
 from tacpipe.tasks.slip.planned import (
+    CHANNELS,
     NAMES_OF_PLAN,
     NAMES_WITH_TOUCH,
+    POINTS,
     PlannedMotion,
     planned_features,
     predicted_ratios,
@@ -31,11 +40,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
-    from tacpipe.tasks.slip.params import SlipModelParams
+    from tacpipe.tasks.slip.params import SlipParams
 
 STABLE, BEFORE, DURING, UNCOUNTED = 0, 1, 2, -1  # states of a row
-BLOCK = 256  # number of windows whose features are computed at once
-TIME = "time since the start"  # last column of the features, which only the baseline time_only reads
 MATCH_NS = 1_000_000_000  # width of the bins of time since the start in which windows are matched
 
 
@@ -111,13 +118,13 @@ class FingerReader(Inputs):
         return names
 
     @property
-    def feature_count(self) -> int:
-        """The number of features."""
-        return len(self.names)
-
-    @property
     def _reads_rows(self) -> bool:
         return all(finger.rows == 1 for finger in self.streams)
+
+    @property
+    def window_shapes(self) -> list[tuple[int, int]]:
+        """Rows and channels of each of `windows`."""
+        return [*super().window_shapes, *([(1 + POINTS, len(CHANNELS))] if self.reads_plans else [])]
 
     def windows(self, rows: InputRows, ends: Indices) -> list[AnyFloats]:
         """Return the windows that end in rows (window, time, channel): of each finger, and of the plan if it is read."""
@@ -126,8 +133,8 @@ class FingerReader(Inputs):
             windows.append(sample_ahead(rows.plans if isinstance(rows, GraspTrack) else None, rows.t_ns[ends]))
         return windows
 
-    def window_features(self, windows: Sequence[AnyFloats]) -> Floats:
-        """Return the features (window, feature) of `windows`: of each finger, then of the plan.
+    def features(self, kind: FeatureKind, windows: Sequence[AnyFloats]) -> Floats:
+        """Return the features (window, feature) of `windows`, as `names`: of each finger, then of the plan.
 
         If windows have one row, the features are the channels of that row.
         """
@@ -148,18 +155,8 @@ class FingerReader(Inputs):
             [features, planned, *([] if self._reads_rows else [predicted_ratios(features, planned)])], axis=1
         )
 
-    def features(self, track: GraspTrack, rows: Indices) -> Floats:
-        """Return the features of rows of a track (row, feature); the last column is the time since the start."""
-        columns = self.feature_count
-        features = np.empty((len(rows), columns + 1))
-        for first in range(0, len(rows), BLOCK):
-            block = slice(first, first + BLOCK)
-            features[block, :columns] = self.window_features(self.windows(track, rows[block]))
-        features[:, columns] = track.since_s[rows]
-        return features
 
-
-def read_training(recordings: Dataset, params: SlipModelParams) -> tuple[FingerReader, list[GraspTrack]]:
+def read_training(recordings: Dataset, params: SlipParams) -> tuple[FingerReader, list[GraspTrack]]:
     """Return the reader for the tactile streams of the training recordings, and those with slip labels as tracks.
 
     Scales are the root mean square of each axis over all training recordings. Raises `TacpipeError` if a recording has
@@ -198,59 +195,24 @@ def _tactile_columns(stream: str, schema: pa.Schema, streams: str) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class TrainingWindows:
-    """Windows to train on, with their labels."""
-
-    reader: FingerReader
-    tracks: tuple[GraspTrack, ...]
-    params: SlipModelParams
-    track: Indices  # (window,), index of the window's track
-    rows: Indices  # (window,), row in the window's track
-    features: Floats  # (window, feature); the last column is the time since the start
-    slips: Bools  # (window,), whether the object slips within the horizon
-    weights: Floats  # (window,)
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    @property
-    def groups(self) -> Indices:
-        """The index of each window's object (window,)."""
-        names = sorted({track.object for track in self.tracks})
-        return np.array([names.index(track.object) for track in self.tracks], np.intp)[self.track]
-
-    def select(self, chosen: Bools) -> TrainingWindows:
-        """Return some of the windows."""
-        return replace(
-            self,
-            track=self.track[chosen],
-            rows=self.rows[chosen],
-            features=self.features[chosen],
-            slips=self.slips[chosen],
-            weights=self.weights[chosen],
-        )
-
-
-def read_windows(
-    reader: FingerReader, tracks: Sequence[GraspTrack], params: SlipModelParams, stride: int = 1
-) -> TrainingWindows:
-    """Return the counted windows of tracks, every ``stride``-th row."""
+def read_examples(reader: FingerReader, tracks: Sequence[GraspTrack], params: SlipParams, stride: int = 1) -> Examples:
+    """Return the counted windows of tracks, every ``stride``-th row; their values (window, 1) are `GraspTrack.states`."""
     horizon_ns, recovery_ns = round(params.horizon_s * 1e9), round(params.recovery_s * 1e9)
-    parts: list[tuple[Int64s, Int64s]] = []
+    parts = []
     for track in tracks:
         states = track.states(horizon_ns, recovery_ns)
         rows = np.flatnonzero(states != UNCOUNTED)[::stride]
         reader.count_rows(track, rows)
-        parts.append((rows, states[rows]))
-    features = [reader.features(track, rows) for track, (rows, _) in zip(tracks, parts, strict=True)]
-    owners = np.repeat(np.arange(len(tracks)), [len(rows) for rows, _ in parts])
-    slips = _joined(states for _, states in parts) > STABLE
-    stacked = np.concatenate(features) if features else np.zeros((0, reader.feature_count + 1))
-    weights = match_time(stacked[:, -1], slips) if params.match_time else np.ones(len(slips))
-    return TrainingWindows(
-        reader, tuple(tracks), params, owners, _joined(rows for rows, _ in parts), stacked, slips, weights
+        parts.append((track, track.object, rows, states[rows, None].astype(np.float64)))
+    examples = join(reader, parts)
+    return (
+        replace(examples, weights=match_time(examples.since_s, are_slips(examples))) if params.match_time else examples
     )
+
+
+def are_slips(examples: Examples) -> Bools:
+    """Return whether the object slips within the horizon (window,)."""
+    return np.asarray(examples.values.reshape(-1) > STABLE)
 
 
 def match_time(since_s: Floats, slips: Bools) -> Floats:
@@ -287,8 +249,3 @@ def shuffle_labels(tracks: Sequence[GraspTrack], seed: int) -> list[GraspTrack]:
         contact = track.labels.contact if track.labels is not None else None
         shuffled.append(replace(track, labels=SlipLabels(events, contact)))
     return shuffled
-
-
-def _joined(parts: Iterable[Int64s]) -> Int64s:
-    """Return arrays joined to one, also if there is none."""
-    return np.concatenate([np.zeros(0, np.int64), *parts])

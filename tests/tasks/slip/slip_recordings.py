@@ -1,11 +1,14 @@
 """Recordings of two fingers in which the shear rises before a slip, for tests of the task slip."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from tacpipe.plugins.stage import Result
+from tacpipe.tasks.slip import training
+from tacpipe.tasks.slip.params import SlipParams
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 
 RATE_HZ = 20.0
@@ -65,3 +68,9 @@ def trials(count: int, first: int = 0, **options: Any) -> list[FakeRecording]:
         held_object(seed, 3.0 + (seed * 7 % 11) / 2 if seed % 2 else None, **options)
         for seed in range(first, first + count)
     ]
+
+
+def trained(params: SlipParams, training_recordings: Any, validation: Any, workspace: Path) -> dict[str, bytes]:
+    """Return the files of a model trained on recordings."""
+    files, _ = training.train(params, training_recordings, validation, workspace)
+    return files

@@ -22,24 +22,25 @@ from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.tasks.learning.live.windows import StreamSoFar
-from tacpipe.tasks.slip import training
 from tacpipe.tasks.slip.calibration import EventScore
 from tacpipe.tasks.slip.labels import SlipLabels
-from tacpipe.tasks.slip.live import demo, evaluation
+from tacpipe.tasks.slip.live import evaluation
 from tacpipe.tasks.slip.live.engine import SlipEngine
 from tacpipe.tasks.slip.live.evaluation import SessionAlarms
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tacpipe.tasks.slip.live.task import SlipLive, SlipSettings
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.params import Boosting, ConvolutionParams
+from tacpipe.tasks.slip.params import SlipBoosting, SlipNetwork
 from tests.fake_recordings import FakeRecording, dataset
 from tests.sensors import made
+from tests.tasks.slip.slip_recordings import trained
+from tests.test_docs import module
 
 STREAMS = ("left", "right")
 PERIOD_NS, START_NS, OFFSET_NS, SETTLE_NS = 20_000_000, 10**12, 5 * 10**17, 2_000_000
-SMALL = Boosting(trees=10, leaves=4, leaf=5, learning_rate=0.3, window_s=0.4, horizon_s=0.4, rest_s=0.1)
+SMALL = SlipBoosting(trees=10, leaves=4, leaf=5, learning_rate=0.3, window_s=0.4, horizon_s=0.4, rest_s=0.1)
 ROWS = 150
-NETWORK = ConvolutionParams(
+NETWORK = SlipNetwork(
     channels=4, layers=2, epochs=1, window_s=0.4, horizon_s=0.4, rest_s=0.1, actions="planned", stride=2
 )
 
@@ -101,7 +102,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def model(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> SlipModel:
-    files = training.train(SMALL, dataset(rig.recording), None, tmp_path_factory.mktemp("workspace"))
+    files = trained(SMALL, dataset(rig.recording), None, tmp_path_factory.mktemp("workspace"))
     return SlipModel.load(files)
 
 
@@ -109,7 +110,7 @@ def model(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> SlipModel:
     scope="module", params=[dataclasses.replace(SMALL, actions="planned"), NETWORK], ids=["trees", "network"]
 )
 def planned_model(request: Any, rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> SlipModel:
-    files = training.train(request.param, dataset(rig.recording), None, tmp_path_factory.mktemp("workspace"))
+    files = trained(request.param, dataset(rig.recording), None, tmp_path_factory.mktemp("workspace"))
     return SlipModel.load(files)
 
 
@@ -306,5 +307,5 @@ def test_the_picture_of_the_demo_shows_each_slip(rig: Rig, model: SlipModel, tmp
     event = EventScore("a", "b", t_ns[160] / 1e9, 180.0, 0.0, 280.0)
     read = model.reader.track(rig.recording)  # type: ignore[arg-type]
     track = dataclasses.replace(read, start_ns=0, labels=SlipLabels(events, None))
-    path = demo.draw(tmp_path / "live.png", stream, track, SessionAlarms([event], 0, 0.05), "one slip")
+    path = module("live_demo").draw(tmp_path / "live.png", stream, track, SessionAlarms([event], 0, 0.05), "one slip")
     assert path.read_bytes().startswith(b"\x89PNG")

@@ -17,16 +17,17 @@ from tacpipe.live.settings import Settings
 from tacpipe.plugins import params as params_of
 from tacpipe.recording import rig as rigs
 from tacpipe.sensors.plan import Plan
-from tacpipe.tasks.slip import evaluation, training
+from tacpipe.tasks.learning.examples import unlabelled
+from tacpipe.tasks.slip import evaluation
 from tacpipe.tasks.slip.live.task import SlipLive, SlipSettings
 from tacpipe.tasks.slip.model import SlipModel
-from tacpipe.tasks.slip.params import Boosting
+from tacpipe.tasks.slip.params import SlipBoosting
 from tacpipe.tasks.slip.planned import GRAVITY_M_S2, POINTS, STEP_NS, motion, sample
-from tacpipe.tasks.slip.windows import read_training
+from tacpipe.tasks.slip.windows import FingerReader, read_training
 from tests.fake_recordings import FakeRecording, dataset
-from tests.tasks.slip.slip_recordings import SECONDS, held_object
+from tests.tasks.slip.slip_recordings import SECONDS, held_object, trained
 
-SMALL = Boosting(
+SMALL = SlipBoosting(
     trees=20, leaves=6, leaf=3, learning_rate=0.2, stride=11, actions="planned"
 )  # few windows are fast to bin
 SLIP_S = 6.0
@@ -106,13 +107,17 @@ def test_no_row_depends_on_what_is_measured_or_planned_after_it(row: int, seed: 
     changed = {name: change_after(table, t_ns, rng) for name, table in {**recording.tables, "robot": arm}.items()}
     rows = np.arange(30, row + 1)
     before, after = (
-        reader.features(reader.track(FakeRecording(tables, "trial", {})), rows)  # type: ignore[arg-type]
+        features_of(reader, FakeRecording(tables, "trial", {}), rows)
         for tables in ({**recording.tables, "robot": arm}, changed)
     )
     assert before.tobytes() == after.tobytes()
     planned = recording.tables["plan"].filter(recording.tables["plan"]["t_ns"].to_numpy() <= t_ns)
     other = dataclasses.replace(recording, tables={**recording.tables, "plan": change_after(planned, 0, rng)})
-    assert (reader.features(reader.track(other), rows)[-1] != before[-1]).any()  # type: ignore[arg-type]
+    assert (features_of(reader, other, rows)[-1] != before[-1]).any()
+
+
+def features_of(reader: FingerReader, recording: Any, rows: np.ndarray) -> np.ndarray:
+    return unlabelled(reader, reader.track(recording), [], rows).features("statistics")
 
 
 def change_after(table: pa.Table, t_ns: int, rng: np.random.Generator) -> pa.Table:
@@ -133,7 +138,7 @@ def test_a_model_with_plans_predicts_slips_that_touch_does_not_announce(tmp_path
     areas = {}
     for actions in ("none", "planned"):
         params = dataclasses.replace(SMALL, actions=actions)
-        files = training.train(params, dataset(*jolted_trials(16)), None, tmp_path / actions)
+        files = trained(params, dataset(*jolted_trials(16)), None, tmp_path / actions)
         metrics = json.loads(evaluation.evaluate(files, dataset(*jolted_trials(12, 100))).files["metrics.json"])
         areas[actions] = metrics["model"]["auc"]["before"]["value"]
         assert ("planned_motion" in metrics) == (actions == "planned")
@@ -142,23 +147,23 @@ def test_a_model_with_plans_predicts_slips_that_touch_does_not_announce(tmp_path
 
 
 def test_a_recording_without_plans_is_predicted_from_touch(tmp_path: Path) -> None:
-    files = training.train(SMALL, dataset(*jolted_trials(8)), None, tmp_path)
+    files = trained(SMALL, dataset(*jolted_trials(8)), None, tmp_path)
     table = SlipModel.load(files).table(held_object(101, SLIP_S))
     assert np.isfinite(table["probability"].to_numpy()).all()
 
 
 def test_training_recordings_without_plans_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="None of 2 training recordings has a stream plan"):
-        training.train(SMALL, dataset(held_object(1, 4.0), held_object(2, None)), None, tmp_path)
+        trained(SMALL, dataset(held_object(1, 4.0), held_object(2, None)), None, tmp_path)
 
 
 def test_params_without_plans_are_stored_as_before() -> None:
-    assert "actions" not in params_of.to_json(Boosting())
+    assert "actions" not in params_of.to_json(SlipBoosting())
     assert params_of.to_json(SMALL)["actions"] == "planned"
 
 
 def test_a_session_of_a_model_with_plans_needs_a_source_of_plans(tmp_path: Path) -> None:
-    files = training.train(SMALL, dataset(*jolted_trials(8)), None, tmp_path)
+    files = trained(SMALL, dataset(*jolted_trials(8)), None, tmp_path)
 
     class Model:
         class source:  # noqa: N801
@@ -170,7 +175,7 @@ def test_a_session_of_a_model_with_plans_needs_a_source_of_plans(tmp_path: Path)
     )
     rig = rigs.parse("".join(streams))
     config = json.loads(files["config.json"])
-    for finger in config["fingers"]:
+    for finger in config["inputs"]:
         finger["channels"] = [field.name for field in rig.streams[finger["stream"]].sensor.fields()][:6]
     files["config.json"] = json.dumps(config).encode()
     model: Any = Model

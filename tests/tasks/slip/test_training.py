@@ -9,24 +9,22 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.slip import evaluation, training
+from tacpipe.tasks.learning.examples import one_window, unlabelled
+from tacpipe.tasks.slip import evaluation
 from tacpipe.tasks.slip.model import SlipModel, calibrate, predict
-from tacpipe.tasks.slip.params import Boosting, ConvolutionParams, ForecastRule
-from tacpipe.tasks.slip.rule import RuleScorer, score_forecasts
+from tacpipe.tasks.slip.params import SlipAuto, SlipBoosting, SlipLinear, SlipNetwork, SlipParams
 from tacpipe.tasks.task import CalibrationRequest
-from tests import commands
 from tests.fake_recordings import FakeRecording, dataset
-from tests.tasks.slip.slip_recordings import held_object, stored, trials
+from tests.tasks.slip.slip_recordings import held_object, stored, trained, trials
 
-SMALL = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2)
+SMALL = SlipBoosting(trees=20, leaves=6, leaf=10, learning_rate=0.2)
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("workspace")
-    return training.train(SMALL, dataset(*trials(16)), dataset(*trials(6, 50)), folder)
+    return trained(SMALL, dataset(*trials(16)), dataset(*trials(6, 50)), folder)
 
 
 def test_a_model_finds_slips_of_unseen_recordings_before_they_begin(files: dict[str, bytes]) -> None:
@@ -45,8 +43,8 @@ def test_a_model_finds_slips_of_unseen_recordings_before_they_begin(files: dict[
 
 
 def test_a_model_of_shuffled_labels_finds_no_slip(tmp_path: Path) -> None:
-    params = Boosting(trees=20, leaves=6, leaf=10, learning_rate=0.2, labels="shuffled", seed=2)
-    files = training.train(params, dataset(*trials(40)), None, tmp_path)
+    params = SlipBoosting(trees=20, leaves=6, leaf=10, learning_rate=0.2, labels="shuffled", seed=2)
+    files = trained(params, dataset(*trials(40)), None, tmp_path)
     metrics = json.loads(evaluation.evaluate(files, dataset(*trials(12, 100))).files["metrics.json"])
     assert metrics["model"]["auc"]["before"]["value"] < 0.7
 
@@ -87,12 +85,10 @@ def test_a_single_window_scores_as_among_others(files: dict[str, bytes]) -> None
     model = SlipModel.load(files)
     track = model.reader.track(held_object(103, 6.0))  # type: ignore[arg-type]
     rows = np.flatnonzero(track.ready)
-    scores = model.scorer.score(model.reader, track, rows)
+    scores = model.scores(unlabelled(model.reader, track, [], rows))
     for row, score in list(zip(rows, scores, strict=True))[::17]:
-        windows = [
-            track.windows(np.array([row]), place, finger.rows)[0] for place, finger in enumerate(model.reader.streams)
-        ]
-        assert model.scorer.score_window(model.reader, windows) == score
+        windows = [part[0] for part in model.reader.windows(track, np.array([row]))]
+        assert model.scores(one_window(model.reader, windows, int(track.t_ns[row]), track.start_ns)) == score
 
 
 def test_calibration_on_other_recordings_sets_levels_and_remembers_the_recordings(files: dict[str, bytes]) -> None:
@@ -106,13 +102,30 @@ def test_calibration_on_other_recordings_sets_levels_and_remembers_the_recording
 
 
 def test_a_network_learns_and_loads_with_the_same_scores(tmp_path: Path) -> None:
-    params = ConvolutionParams(channels=6, layers=3, epochs=2, stride=4, batch=64)
-    files = training.train(params, dataset(*trials(8)), dataset(*trials(4, 50)), tmp_path)
+    params = SlipNetwork(channels=6, layers=3, epochs=2, stride=4, batch=64)
+    files = trained(params, dataset(*trials(8)), dataset(*trials(4, 50)), tmp_path)
     first, second = (
         predict(files, dataset(held_object(101, 6.0))).recordings["trial-101"].streams[""] for _ in range(2)
     )
     assert first.equals(second)
     assert np.ptp(first["score"].to_numpy()) > 0
+
+
+def test_the_default_is_the_simplest_that_no_other_surpasses(tmp_path: Path) -> None:
+    config = json.loads(trained(SlipAuto(stride=2), dataset(*trials(24)), None, tmp_path)["config.json"])
+    losses = {row["name"]: row for row in config["candidates"]}
+    assert list(losses) == ["constant", "time_only", "best_feature", "linear", "boosting"]
+    assert config["chosen"] == "linear"
+    assert losses["linear"]["excess"] <= losses["linear"]["error"]
+    assert losses["linear"]["loss"] < min(row["loss"] for row in losses.values() if row["baseline"])
+
+
+@pytest.mark.parametrize("params", [SlipLinear(), SMALL, SlipNetwork(epochs=1, channels=4, layers=2)])
+def test_a_single_estimator_is_trained_whatever_its_baselines_reach(params: SlipParams, tmp_path: Path) -> None:
+    params = dataclasses.replace(params, stride=10)
+    config = json.loads(trained(params, dataset(*trials(12)), None, tmp_path)["config.json"])
+    assert config["chosen"] == params.architecture
+    assert not config["chosen_is_baseline"]
 
 
 @pytest.mark.parametrize(
@@ -124,32 +137,15 @@ def test_a_network_learns_and_loads_with_the_same_scores(tmp_path: Path) -> None
 )
 def test_recordings_that_teach_nothing_are_refused(recordings: list[Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match=message):
-        training.train(SMALL, dataset(*recordings), None, tmp_path)
+        trained(SMALL, dataset(*recordings), None, tmp_path)
 
 
 def test_files_of_another_model_are_refused(files: dict[str, bytes]) -> None:
     config = json.loads(files["config.json"])
-    config["fingers"] = config["fingers"][:1]
+    config["inputs"] = config["inputs"][:1]
     damaged = {**files, "config.json": json.dumps(config).encode()}
     with pytest.raises(TacpipeError, match="do not fit one another"):
         SlipModel.load(damaged)
-
-
-def test_a_rule_without_a_forward_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TacpipeError, match="names no model"):
-        training.train(ForecastRule(), dataset(*trials(4)), None, tmp_path)
-
-
-def test_the_rule_scores_the_rise_and_the_fall_of_the_predicted_shear() -> None:
-    values = {"x": {1: 1.0, 3: 3.0, 5: 2.0}, "y": {1: 0.0, 3: 0.0, 5: 0.0}, "z": {1: 2.0, 3: 2.0, 5: 2.0}}
-    fields, columns = [pa.field("t_ns", pa.int64())], [pa.array([0])]
-    for axis, by_step in values.items():
-        for step, value in by_step.items():
-            about = {"quantity": "prediction", "stream": "left", "axis": axis, "step": str(step)}
-            fields.append(pa.field(f"left_{axis}_t{step}", pa.float32(), metadata=about))
-            columns.append(pa.array([value], pa.float32()))
-    table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
-    assert score_forecasts(table).tolist() == [1.5]  # rises by 2 and falls by 1, at a load of 2
 
 
 def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path) -> None:
@@ -165,7 +161,7 @@ def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path)
         return FakeRecording({"hand": table}, f"object-{seed}")
 
     params = dataclasses.replace(SMALL, window_s=0.0, horizon_s=0.0, rest_s=0.0, match_time=False)
-    files = training.train(params, dataset(*map(grasps, range(8))), None, tmp_path)
+    files = trained(params, dataset(*map(grasps, range(8))), None, tmp_path)
     metrics = json.loads(evaluation.evaluate(files, dataset(*map(grasps, range(20, 24)))).files["metrics.json"])
     assert metrics["counts"]["windows"] == 160
     assert metrics["model"]["accuracy"]["value"] > 0.9 > 0.7 > metrics["constant"]["accuracy"]["value"]
@@ -173,30 +169,5 @@ def test_windows_of_one_row_tell_stable_grasps_from_sliding_ones(tmp_path: Path)
     recording = grasps(30)
     model = SlipModel.load(files)
     track = model.reader.track(recording)  # type: ignore[arg-type]
-    assert (
-        model.scorer.score_window(model.reader, [track.streams[0].values[:1]])
-        == model.table(recording)["score"][0].as_py()
-    )
-
-
-def test_the_rule_reads_the_forecasts_of_a_forward_model(tmp_path: Path) -> None:
-    (tmp_path / ".tacpipe").mkdir()
-    lines = [
-        "simulate forward --trials 5 --duration-s 4 --effort 1.2 --robot-rate-hz 50 --seed 3 -o raw",
-        "synchronize raw --streams xela* --rate-hz 20 -o even",
-        "segment contacts even -o segments",
-        "split segments -o split --scheme random --val 0.4 --test 0",
-        "train forward segments --split split --actions none --epochs 1 -o forward",
-    ]
-    commands.run(tmp_path, lines)
-    table = RuleScorer(str(tmp_path / "forward"), "").forecasts(tacpipe.open(tmp_path / "segments")["trial-000"])
-    for place, name in enumerate(table.column_names):
-        if name.startswith("xela1") and name.endswith("_x_t5"):  # the shear rises five steps ahead and falls later
-            table = table.set_column(place, table.schema.field(place), pa.array(table[name].to_numpy() + 1000))
-    assert (score_forecasts(table) > 0.1).all()
-    rule = ForecastRule(forward_model=str(tmp_path / "forward"), streams="xela*")
-    files = training.train(rule, tacpipe.open(tmp_path / "raw"), None, tmp_path / "workspace")
-    assert SlipModel.load(files).scorer.describe()["forward_digest"] == rule.forward_digest
-    commands.run(tmp_path, [lines[-1].replace("--epochs 1", "--epochs 1 --seed 1")])
-    with pytest.raises(TacpipeError, match="has the digest"):
-        SlipModel.load(files)
+    first = one_window(model.reader, [track.streams[0].values[:1]], 0, 0)
+    assert model.scores(first)[0] == model.table(recording)["score"][0].as_py()

@@ -17,20 +17,24 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.boosting import BoostedTrees, TreeSizes
 from tacpipe.scores import pairing
 from tacpipe.scores.pairing import Sums
+from tacpipe.tasks.learning import estimators
+from tacpipe.tasks.learning.estimators import FittedLinear
+from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.features import ChannelAxes, stream_features
 from tacpipe.tasks.slip import calibration, evaluation, metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack, SlipCalibration
 from tacpipe.tasks.slip.labels import read_labels
-from tacpipe.tasks.slip.params import Boosting
-from tacpipe.tasks.slip.scorers import LinearScorer, best_column
+from tacpipe.tasks.slip.params import SlipBoosting
+from tacpipe.tasks.slip.training import areas, best_column, fit_columns, scores_of
 from tacpipe.tasks.slip.windows import (
     BEFORE,
     DURING,
     STABLE,
     UNCOUNTED,
+    are_slips,
     match_time,
+    read_examples,
     read_training,
-    read_windows,
     shuffle_labels,
 )
 from tests.fake_recordings import FakeRecording, dataset
@@ -81,44 +85,45 @@ def test_boosted_trees_score_as_scikit_learn_does(missing: float) -> None:
     assert loaded.scores(rows[:1]).tobytes() == trees.scores(rows)[:1].tobytes()
 
 
-def test_the_linear_baseline_scores_as_the_regression_of_scikit_learn_does() -> None:
-    reader, tracks = read_training(dataset(*trials(8)), Boosting())
-    windows = read_windows(reader, tracks, Boosting(), stride=5)
-    scorer = LinearScorer.fit(windows)
-    columns, counted = list(scorer.columns), windows.weights > 0
-    rows = windows.features[:, columns]
-    scaler = StandardScaler().fit(rows[counted])
-    oracle = LogisticRegression(C=1 / (0.01 * windows.weights.sum()), max_iter=1000)
-    oracle.fit(scaler.transform(rows[counted]).clip(-10, 10), windows.slips[counted], windows.weights[counted])
-    scores = scorer.score_features(windows.features)
-    assert scores == pytest.approx(oracle.decision_function(scaler.transform(rows).clip(-10, 10)), abs=1e-3)
-    loaded = LinearScorer.load(scorer.arrays(), scorer.describe(), reader)
-    assert loaded.score_features(windows.features[3:4]).tobytes() == scores[3:4].tobytes()
-    with pytest.raises(ValueError, match="columns"):
-        LinearScorer.load({**scorer.arrays(), "weights": np.zeros(2)}, scorer.describe(), reader)
+def examples_of(recordings: int = 8) -> Examples:
+    """Return every fifth window of recordings."""
+    reader, tracks = read_training(dataset(*trials(recordings)), SlipBoosting())
+    return read_examples(reader, tracks, SlipBoosting(), stride=5)
 
 
-def test_the_best_feature_has_the_largest_area_of_all_in_either_direction() -> None:
-    reader, tracks = read_training(dataset(*trials(8)), Boosting())
-    windows = read_windows(reader, tracks, Boosting(), stride=5)
+def test_a_regression_of_weighted_windows_scores_as_that_of_scikit_learn_does() -> None:
+    examples = examples_of()
+    rows, slips, weights = examples.features("statistics"), are_slips(examples), examples.training_weights
+    known = np.isfinite(rows).all(axis=0)
+    scaler = StandardScaler().fit(rows[:, known])
+    oracle = LogisticRegression(C=1 / (0.01 * weights.sum()), max_iter=1000)
+    oracle.fit(scaler.transform(rows[:, known]).clip(-10, 10), slips, weights)
+    fitted = FittedLinear.fit(examples, np.stack([~slips, slips], axis=1).astype(float), "class")
+    expected = oracle.decision_function(scaler.transform(rows[:, known]).clip(-10, 10))
+    assert scores_of(fitted.outputs(examples)) == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_best_feature_has_the_largest_mean_area_of_all_in_either_direction() -> None:
+    examples = examples_of()
+    features = examples.features("statistics")
+    varying = [column for column in features.T if np.isfinite(column).any() and np.nanmax(column) > np.nanmin(column)]
 
     def area(values: np.ndarray) -> float:
-        return float(roc_auc_score(windows.slips, np.nan_to_num(values), sample_weight=windows.weights))
+        return float(np.mean(areas(np.nan_to_num(values), examples)))
 
-    best = max(abs(area(column) - 0.5) for column in windows.features[:, :-1].T)
-    scores = LinearScorer.fit(windows, [best_column(windows)]).score_features(windows.features)
-    assert area(scores) == pytest.approx(0.5 + best, abs=1e-9)
-    opposite = dataclasses.replace(windows, features=-windows.features)
-    assert best_column(opposite) == best_column(windows)
-    opposite_scores = LinearScorer.fit(opposite, [best_column(opposite)]).score_features(opposite.features)
-    assert area(opposite_scores) == pytest.approx(0.5 + best, abs=1e-9)
+    best = max(max(area(column), area(-column)) for column in varying)
+    column = best_column(examples)
+    assert max(area(features[:, column]), area(-features[:, column])) == pytest.approx(best, abs=1e-9)
+    opposite = dataclasses.replace(examples, _features={"statistics": -features})
+    assert best_column(opposite) == column
 
 
-def test_the_best_feature_is_never_the_time() -> None:
-    reader, tracks = read_training(dataset(*trials(8)), Boosting())
-    windows = read_windows(reader, tracks, Boosting(), stride=5)
-    windows.features[:, -1] = windows.slips
-    assert best_column(windows) < reader.feature_count
+def test_a_baseline_of_some_columns_loads_with_the_same_bits() -> None:
+    examples = examples_of()
+    outputs = np.stack([~are_slips(examples), are_slips(examples)], axis=1).astype(float)
+    fitted = fit_columns(FittedLinear.fit, examples, outputs, [best_column(examples)])
+    loaded = estimators.load(fitted.arrays(), fitted.describe(), 2)
+    assert loaded.outputs(examples).tobytes() == fitted.outputs(examples).tobytes()
 
 
 def test_trees_whose_nodes_lead_back_are_refused() -> None:
@@ -235,7 +240,7 @@ def test_matched_windows_with_and_without_a_slip_have_the_same_distribution_of_t
 
 
 def test_states_are_before_during_and_after_a_slip_and_unknown_at_the_end() -> None:
-    _, (track,) = read_training(dataset(held_object(1, 5.0)), Boosting())
+    _, (track,) = read_training(dataset(held_object(1, 5.0)), SlipBoosting())
     states = track.states(1_000_000_000, 500_000_000)
     at_s = track.since_s
 
@@ -254,7 +259,7 @@ def test_rows_without_contact_are_not_counted() -> None:
 
     contact = np.where(table["t_ns"].to_numpy() < 4_000_000_000, 0, -1).astype(np.int8)
     with_contact = {**recording.tables, "left": table.append_column("contact", pa.array(contact))}
-    _, (track,) = read_training(dataset(dataclasses.replace(recording, tables=with_contact)), Boosting())
+    _, (track,) = read_training(dataset(dataclasses.replace(recording, tables=with_contact)), SlipBoosting())
     states = track.states(1_000_000_000, 0)
     assert (states[track.since_s >= 4.0] == UNCOUNTED).all()
     assert (states[(track.since_s > 2) & (track.since_s < 4)] == STABLE).all()
@@ -288,7 +293,7 @@ def test_an_interval_that_is_no_interval_is_refused() -> None:
 
 
 def test_shuffled_labels_keep_the_number_of_slips_and_their_times() -> None:
-    _, tracks = read_training(dataset(*trials(8)), Boosting())
+    _, tracks = read_training(dataset(*trials(8)), SlipBoosting())
     shuffled = shuffle_labels(tracks, 1)
     assert sorted((track.events - track.start_ns).tolist() for track in tracks) == sorted(
         (track.events - track.start_ns).tolist() for track in shuffled
@@ -300,7 +305,7 @@ def test_a_recording_of_other_channels_is_refused() -> None:
     recording = held_object(2, None)
     fewer = {**recording.tables, "right": recording.tables["right"].drop_columns(["taxel01_x"])}
     with pytest.raises(TacpipeError, match="other input channels"):
-        read_training(dataset(held_object(1, None), dataclasses.replace(recording, tables=fewer)), Boosting())
+        read_training(dataset(held_object(1, None), dataclasses.replace(recording, tables=fewer)), SlipBoosting())
 
 
 def scored(scores: np.ndarray, states: np.ndarray, events: list[list[int]] | None = None) -> ScoredTrack:

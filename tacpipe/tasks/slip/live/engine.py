@@ -16,6 +16,7 @@ from tacpipe.live.engine import SETTLE_NS
 from tacpipe.sensors.live import OFF, ON
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.learning.examples import one_window
 from tacpipe.tasks.learning.inputs import InputStream
 from tacpipe.tasks.learning.live.engine import WindowEngine
 from tacpipe.tasks.learning.live.windows import LiveRow, RecordedWindows
@@ -78,7 +79,7 @@ class SlipEngine(WindowEngine):
         reader = self._model.reader
         ahead = [self._plans.ahead(row.t_ns)] if reader.reads_plans else []
         self._plans.forget_before(row.t_ns)
-        score = self._model.scorer.score_window(reader, [*row.windows, *ahead])
+        score = float(self._model.scores(one_window(reader, [*row.windows, *ahead], row.t_ns, row.start_ns))[0])
         probability = float(self._model.calibration.probability(np.array([score]))[0])
         state = ON if score >= self._level else OFF
         touch = {

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import numpy as np
-
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
@@ -54,11 +52,11 @@ class SlipLive(LiveTask):
 
         own = _own(settings)
         config = model_files.tree(
-            model.files, model_files.CONFIG, {"fingers": list, "calibration.levels": dict, "params": dict}
+            model.files, model_files.CONFIG, {"inputs": list, "calibration.levels": dict, "params": dict}
         )
         _require_recorded(model)
         _level_name(config["calibration"]["levels"], own.alarms_per_minute)
-        for finger in config["fingers"]:
+        for finger in config["inputs"]:
             if finger["stream"] not in rig.streams:
                 raise UsageError(
                     f"The model reads the stream {finger['stream']}, and the rig has {listed(rig.streams)}. Take the "
@@ -82,28 +80,16 @@ class SlipLive(LiveTask):
         return SessionPlan(planned, own, {SLIP: {}, "latency": {}}, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> SlipEngine:
-        """Return the engine of a session, which has scored its first window.
-
-        Raises `UsageError` if the model is the rule on forecasts.
-        """
+        """Return the engine of a session, which has scored its first window."""
         from tacpipe.tasks.slip.live.engine import SlipEngine
         from tacpipe.tasks.slip.model import SlipModel
-        from tacpipe.tasks.slip.planned import PlannedMotion
 
-        loaded = SlipModel.load(model.files)
-        if not loaded.scorer.runs_live:
-            raise UsageError("The rule on forecasts does not run live. Train a model with --architecture boosting.")
+        loaded = SlipModel.load(model.files)  # it scores a window, so that the first sample does not wait
         name = _level_name(loaded.calibration.levels, _own(settings).alarms_per_minute)
         fingers = loaded.reader.streams
         layouts = {finger.stream: _grid(finger.layout) for finger in fingers}
-        description = SlipDescription(settings.model, loaded.config["rate_hz"], loaded.params.horizon_s, name, layouts)
-        windows = [np.zeros((finger.rows, len(finger.channels))) for finger in fingers]
-        streams = [finger.stream for finger in fingers]
-        if loaded.reader.reads_plans:
-            windows.append(PlannedMotion().ahead(0))
-            streams.append(PLAN)
-        # this imports and allocates everything, so that the first sample does not wait
-        loaded.scorer.score_window(loaded.reader, windows)
+        description = SlipDescription(settings.model, fingers[0].rate_hz, loaded.params.horizon_s, name, layouts)
+        streams = [*(finger.stream for finger in fingers), *([PLAN] if loaded.reader.reads_plans else [])]
         return SlipEngine(
             loaded,
             {stream: sensors[stream] for stream in streams},

@@ -1,4 +1,4 @@
-"""A live session without hardware: `make live-demo`.
+"""A live session with a slip model and without hardware: `make live-demo`.
 
 A model is trained on simulated trials whose slips the planned motion causes. Then further such trials are replayed as the
 first paper's rig, a controller sends its plans, and the session runs on it. At the end, the slips of the simulation and
@@ -7,19 +7,15 @@ the alarms are printed, and drawn. Seeds and parameters of the simulation are th
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 
 import tacpipe
 from tacpipe.arrays import AnyFloats, Floats, Times
@@ -28,7 +24,7 @@ from tacpipe.io import terminal
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.sensors import plan
-from tacpipe.simulation import pick_and_move
+from tacpipe.simulation.emulation.controller import send_plans
 from tacpipe.simulation.emulation.emulator import ReplayEmulator
 from tacpipe.simulation.emulation.replay import Replay
 from tacpipe.tasks.slip.calibration import EventScore
@@ -37,31 +33,8 @@ from tacpipe.tasks.slip.live.evaluation import SessionAlarms, score_session
 from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.windows import GraspTrack
 
-
-@contextlib.contextmanager
-def send_plans(poses_at: Callable[[Times], Floats], epoch_ns: int, port: int, rate_hz: float) -> Iterator[None]:
-    """Send plans at a rate to a UDP port of this computer in the block.
-
-    ``poses_at`` returns the poses (time, 7) at times since ``epoch_ns`` on the monotonic clock.
-    """
-    is_over = threading.Event()
-    offset_ns = time.time_ns() - time.monotonic_ns()
-
-    def send_repeatedly() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
-            while not is_over.wait(1 / rate_hz):
-                t_ns = time.monotonic_ns() - epoch_ns + pick_and_move.plan_points_ns()
-                packet = plan.packet((t_ns + epoch_ns + offset_ns).tolist(), poses_at(t_ns))
-                controller.sendto(packet, ("127.0.0.1", port))
-
-    controller = threading.Thread(target=send_repeatedly, daemon=True)
-    controller.start()
-    try:
-        yield
-    finally:
-        is_over.set()
-        controller.join()
-
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 TRIALS, TRAINING_SEED = 80, 0
 EFFORT = 1.15  # ratio of the plan's largest load to the friction limit: each trial slips because of its plan
@@ -73,7 +46,8 @@ PLAN_RATE_HZ = 10.0  # plans per second
 PER_MINUTE = "1"  # false alarms per minute for which the alarm's level was set
 TRAINING = (
     *("--streams", "xela*", "--window-s", "0.5", "--horizon-s", "0.3", "--recovery-s", "0.3", "--no-match-time"),
-    *("--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10", "--stride", "2", "--actions", "planned"),
+    *("--architecture", "boosting", "--trees", "300", "--leaves", "31", "--leaf", "50", "--l2", "10"),
+    *("--stride", "2", "--actions", "planned"),
 )
 VALIDATION = ("--val", "0.25", "--test", "0")  # validation recordings set the level of the alarm
 BEFORE_MS, AFTER_MS = 500.0, 200.0  # duration around a slip that is drawn enlarged
