@@ -26,7 +26,8 @@ COMMANDS = {
     "simulate.touch": "simulate touch --trials 2 --seed 7 -o {0}",
     "segment.grasps": "segment grasps raw -o {0}",
     "segment.losses": "segment losses held --streams xela* -o {0}",
-    "train.slip": "train slip held --split held-split --streams xela* --architecture boosting --trees 5 --leaf 5 --no-match-time -o {0}",
+    "train.slip": "train slip held --split held-split --streams xela* --architecture boosting --trees 5 --leaf 5 "
+    "--no-match-time -o {0}",
     "split": "split segment.contacts --scheme random --val 0.34 --test 0.34 -o {0}",
     "compress.pca": "compress pca segment.contacts --split split --components 4 -o {0}",
 }

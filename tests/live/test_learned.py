@@ -1,5 +1,7 @@
 """A live session of a model of forces on an emulated rig: what is published is recorded, and follows from the recording."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -42,6 +44,9 @@ def test_published_forces_are_recorded_and_are_those_that_predict_gives_for_the_
     for message in answered:
         assert all(recorded[message["t_ns"]][name] == value for name, value in message["values"].items())
     lab.run("predict models/force rec -o predicted --causal")
+    evaluated = lab.run("evaluate models/force rec --live -o results").err
+    compared = re.search(r"(\d+) of (\d+) published answers are what", evaluated)
+    assert compared and compared[1] == compared[2] and int(compared[2]) > 80
     (predicted,) = tacpipe.open("predicted")
     table = predicted.table()
     expected = dict(zip(table["t_ns"].to_pylist(), table["gt_finger1_normal_n"].to_pylist(), strict=True))

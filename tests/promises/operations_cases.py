@@ -277,7 +277,8 @@ STAGES = (
     Case("segment.losses", "segment losses data/r -o data/losses --streams xela*", HELD[:2]),
     Case(
         "train.slip",
-        "train slip data/r --split data/split --streams xela* -o models/s --architecture boosting --trees 2 --leaf 5 --no-match-time",
+        "train slip data/r --split data/split --streams xela* -o models/s --architecture boosting --trees 2 --leaf 5 "
+        "--no-match-time",
         HELD,
     ),
     Case(

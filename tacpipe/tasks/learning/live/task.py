@@ -17,7 +17,7 @@ from tacpipe.tasks.learning.live.messages import CLASS, CLASSES, ESTIMATE, ESTIM
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.datasets.dataset import Dataset, Model, Recording
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.sensor import Options, Sensor
     from tacpipe.store.records import Step
@@ -77,25 +77,26 @@ class LearnedLive(LiveTask):
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
         """Return the answers that a session would publish for recordings as they were recorded."""
-        from tacpipe.live.stages import arrival_streams, streams_as_recorded
-        from tacpipe.tasks.learning.live.answering import outputs_of
-        from tacpipe.tasks.learning.live.windows import replayed
         from tacpipe.tasks.learning.model import LearnedModel
 
         loaded = LearnedModel.load(model.files)
         chain = model.source.chain
         check_causal(chain, loaded.config["params"], allow_look_ahead=request.allow_look_ahead)
         levels = loaded.quantile_places(request.quantiles)
-        outputs = {}
-        for name, recording in sorted(recordings.recordings.items()):
-            tables = streams_as_recorded(recording)
-            schemas = {stream: table.schema for stream, table in tables.items()}
-            master = str(recording.attributes.get("master") or loaded.config["master"])
-            windows = windows_for(loaded, chain, schemas, master, {}, arrival_streams(recording, tables))
-            rows = [row for row in replayed(windows, tables) if row.windows is not None]
-            table = loaded.to_table([row.t_ns for row in rows], outputs_of(loaded, rows), levels)
-            outputs[name] = RecordingOutput(table, {"causal": True})
-        return Result(outputs)
+        return Result(
+            {
+                name: RecordingOutput(causal_answers(loaded, chain, recording, levels), {"causal": True})
+                for name, recording in sorted(recordings.recordings.items())
+            }
+        )
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return the evaluation of recorded sessions."""
+        from tacpipe.tasks.learning.live import evaluation
+        from tacpipe.tasks.learning.model import LearnedModel
+
+        predict = functools.partial(causal_answers, LearnedModel.load(model.files), model.source.chain)
+        return evaluation.evaluate(model, recordings, self.stream, predict)
 
 
 class RegressLive(LearnedLive):
@@ -110,6 +111,22 @@ class ClassifyLive(LearnedLive):
 
     declaration: ClassVar[Declaration] = CLASSES
     stream: ClassVar[str] = CLASS
+
+
+def causal_answers(
+    model: LearnedModel, chain: Sequence[Step], recording: Recording, levels: Sequence[int] = ()
+) -> pa.Table:
+    """Return the answers of a session to a recording as it was recorded, with the quantiles at these indices."""
+    from tacpipe.live.stages import arrival_streams, streams_as_recorded
+    from tacpipe.tasks.learning.live.answering import outputs_of
+    from tacpipe.tasks.learning.live.windows import replayed
+
+    tables = streams_as_recorded(recording)
+    schemas = {stream: table.schema for stream, table in tables.items()}
+    master = str(recording.attributes.get("master") or model.config["master"])
+    windows = windows_for(model, chain, schemas, master, {}, arrival_streams(recording, tables))
+    rows = [row for row in replayed(windows, tables) if row.windows is not None]
+    return model.to_table([row.t_ns for row in rows], outputs_of(model, rows), levels)
 
 
 def check_causal(chain: Sequence[Step], params: Mapping[str, Any], *, allow_look_ahead: bool) -> None:

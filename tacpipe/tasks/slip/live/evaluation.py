@@ -1,26 +1,23 @@
-"""Evaluate recordings of live sessions: what was published next to what `predict --causal` computes, and the latencies."""
+"""Evaluate recordings of live sessions: what was published, its latencies, and what the alarms did."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tacpipe.arrays import Bools, Times
-from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Model, Recording
-from tacpipe.errors import UsageError
-from tacpipe.live.messages import summarize_latencies
 from tacpipe.plugins.stage import Result
+from tacpipe.tasks.learning.live.evaluation import evaluate as compare_sessions
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.live.messages import SLIP
 from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.windows import GraspTrack
-
-MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 
 
 def evaluate(model: Model, recordings: Dataset) -> Result:
@@ -29,53 +26,14 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     Raises `UsageError` for a recording without a session, or of another model.
     """
     loaded = SlipModel.load(model.files)
-    live = {}
-    for name, recording in sorted(recordings.recordings.items()):
-        if SLIP not in recording.streams or "probability" not in recording.columns(SLIP).column_names:
-            raise UsageError(
-                f"{name} is not a recording of a live session with a slip model. Give what `tacpipe live -o` recorded, or "
-                f"leave --live out."
-            )
-        if recording.attributes.get(MODEL, model.digest) != model.digest:
-            raise UsageError(
-                f"The session of {name} ran another model. Give the model that it ran, or leave --live out."
-            )
-        live[name] = _session(loaded, recording)
-    totals = {key: sum(session[key] for session in live.values()) for key in ("published", "compared", "equal")}
-    notes = [
-        f"{totals['equal']} of {totals['compared']} published probabilities are what `tacpipe predict --causal` gives, bit "
-        f"for bit."
-    ]
-    metrics = {"live": {**totals, "recordings": live}}
-    return Result(
-        files={model_files.CONFIG: model.files[model_files.CONFIG], "metrics.json": model_files.to_json(metrics)},
-        notes=notes,
-    )
 
+    def measure(recording: Recording, times: Times, published: Mapping[str, Any]) -> dict[str, Any]:
+        track = loaded.reader.track(recording)
+        if track.labels is None:
+            return {}
+        return {"alarms": score_session(loaded, track, times, published["alarm"] > 0).to_json()}
 
-def _session(model: SlipModel, recording: Recording) -> dict[str, Any]:
-    """Return the figures of one recorded session: counts of rows, latency, and alarms if slips are labelled."""
-    stream, predicted = recording.table(SLIP), model.table(recording)
-    clock = "t_device_ns" if "t_device_ns" in stream.column_names else "t_ns"
-    published = {name: stream[name].to_numpy() for name in (clock, "probability", "score", "alarm")}
-    answered = np.isfinite(published["probability"])
-    times = published[clock][answered]
-    _, published_rows, predicted_rows = np.intersect1d(times, predicted["t_ns"].to_numpy(), return_indices=True)
-    same = np.ones(len(published_rows), bool)
-    for name in ("probability", "score"):
-        sent, computed = published[name][answered][published_rows], predicted[name].to_numpy()[predicted_rows]
-        same &= sent.view(np.int64) == computed.view(np.int64)
-    session: dict[str, Any] = {
-        "published": int(answered.sum()),
-        "compared": len(published_rows),
-        "equal": int(same.sum()),
-        "latency": summarize_latencies(recording.table("latency")["latency_ms"].to_numpy()),
-    }
-    track = model.reader.track(recording)
-    if track.labels is not None:
-        alarms = score_session(model, track, times, published["alarm"][answered] > 0)
-        session["alarms"] = alarms.to_json()
-    return session
+    return compare_sessions(model, recordings, SLIP, loaded.table, measure)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""Evaluate recordings of live sessions: what was published next to what `predict --causal` computes, and the latencies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import Times
+from tacpipe.datasets import model_files
+from tacpipe.datasets.dataset import Dataset, Model, Recording
+from tacpipe.errors import UsageError
+from tacpipe.live.messages import summarize_latencies
+from tacpipe.plugins.stage import Result
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
+# a recording, the times of its answers (row,) and its published columns at these -> further figures
+Measure = Callable[[Recording, Times, Mapping[str, Any]], Mapping[str, Any]]
+
+
+def evaluate(
+    model: Model,
+    recordings: Dataset,
+    stream: str,
+    predict: Callable[[Recording], pa.Table],
+    measure: Measure = lambda recording, times, published: {},
+) -> Result:
+    """Return rows, equality and latencies of sessions that published ``stream``, with what ``measure`` adds.
+
+    ``predict`` returns the answers that follow from a recording. Raises `UsageError` for a recording without a session, or
+    of another model.
+    """
+    sessions = {}
+    for name, recording in sorted(recordings.recordings.items()):
+        if stream not in recording.streams or "latency" not in recording.streams:
+            raise UsageError(
+                f"{name} is not a recording of a live session with this model: it has no stream {stream}. Give what "
+                f"`tacpipe live -o` recorded, or leave --live out."
+            )
+        if recording.attributes.get(MODEL, model.digest) != model.digest:
+            raise UsageError(
+                f"The session of {name} ran another model. Give the model that it ran, or leave --live out."
+            )
+        sessions[name] = _session(recording, recording.table(stream), predict(recording), measure)
+    totals = {key: sum(session[key] for session in sessions.values()) for key in ("published", "compared", "equal")}
+    notes = [
+        f"{totals['equal']} of {totals['compared']} published answers are what `tacpipe predict --causal` gives, bit for "
+        f"bit."
+    ]
+    metrics = {"live": {**totals, "recordings": sessions}}
+    return Result(
+        files={model_files.CONFIG: model.files[model_files.CONFIG], "metrics.json": model_files.to_json(metrics)},
+        notes=notes,
+    )
+
+
+def _session(recording: Recording, stream: pa.Table, predicted: pa.Table, measure: Measure) -> dict[str, Any]:
+    """Return the figures of one recorded session."""
+    clock = "t_device_ns" if "t_device_ns" in stream.column_names else "t_ns"
+    compared = [
+        field.name for field in predicted.schema if field.name in stream.column_names and str(field.type) == "double"
+    ]
+    columns = {name: stream[name].to_numpy() for name in stream.column_names}
+    answered = np.asarray(np.isfinite([columns[name] for name in compared]).all(axis=0))
+    published = {name: values[answered] for name, values in columns.items()}
+    _, rows, predicted_rows = np.intersect1d(published[clock], predicted["t_ns"].to_numpy(), return_indices=True)
+    equal = np.ones(len(rows), bool)
+    for name in compared:
+        computed = predicted[name].to_numpy()[predicted_rows]
+        equal &= published[name][rows].view(np.int64) == computed.view(np.int64)
+    return {
+        "published": int(answered.sum()),
+        "compared": len(rows),
+        "equal": int(equal.sum()),
+        "latency": summarize_latencies(recording.table("latency")["latency_ms"].to_numpy()),
+        **measure(recording, published[clock], published),
+    }
