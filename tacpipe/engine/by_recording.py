@@ -20,11 +20,13 @@ from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError
 from tacpipe.io import terminal
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.plugins import registry
+from tacpipe.printable import grouped_failures
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import ComputedResult, GroupIdentity, Provenance, RecordingEntry, Step, StoredResult
 from tacpipe.store.store import Store
 
+NAMED = 3  # maximum number of recordings that are named for an error
 SHOWN = 100  # maximum number of recordings that are listed one by one when some could not be read
 Answer = Mapping[str, RecordingEntry] | pages.Pages  # results of a group of recordings
 
@@ -278,11 +280,12 @@ class ByRecording:
             raise LockedError(lock_errors[0])
         lines = _verdicts({recording: bad[recording].error for recording in bad}, good)
         plural = "recordings" if len(bad) > 1 else "recording"
-        advice = "fix these." if other_errors else "fix these, or leave them out with --skip-bad."
+        advice = "Fix these." if other_errors else "Fix these, or leave them out with --skip-bad."
+        kept = "The other recordings are kept in the store. " if good else ""
         raise error(
             max(failure.exit_code for failure in bad.values()),
-            f"{registry.stage_name(name)} could not read {len(bad)} {plural} of {len(bad) + len(good)}:\n{lines}\nThe "
-            f"other recordings are kept in the store; {advice}",
+            f"{registry.stage_name(name)} could not read {len(bad)} {plural} of {len(bad) + len(good)}:\n{lines}\n"
+            f"{kept}{advice}",
         )
 
 
@@ -305,19 +308,19 @@ def error(exit_code: int, sentence: str) -> TacpipeError:
 
 
 def _verdicts(bad: Mapping[str, str], good: Mapping[str, ComputedResult]) -> str:
-    """Return one line per recording, with its error or its rows; of many recordings only those with errors."""
-    verdicts = dict(bad)
+    """Return one line per error with its recordings, then one per recording with its rows if they are not many."""
+    verdicts = [_lines(bad)]
     if len(bad) + len(good) <= SHOWN:
-        for recording, record in good.items():
+        for recording, record in sorted(good.items()):
             entries = record["result"]["recordings"].values()
             rows = sum(shard.get("rows", 0) for entry in entries for shard in entry["shards"].values())
-            verdicts[recording] = f"read, {rows} rows"
-    width = max(map(len, verdicts)) + 1
-    return "\n".join(f"  {f'{recording}:':<{width}} {verdicts[recording]}" for recording in sorted(verdicts))
+            verdicts.append(f"  {recording}: read, {rows} rows")
+    return "\n".join(verdicts)
 
 
 def _lines(bad: Mapping[str, str]) -> str:
-    return "\n".join(f"  {recording}: {bad[recording]}" for recording in sorted(bad))
+    """Return one line per error, with the first recordings that have it."""
+    return "\n".join(f"  {line}" for line in grouped_failures(dict(sorted(bad.items())), NAMED))
 
 
 def run_chain_of_model(recordings: Dataset, model: Dataset) -> Dataset:
