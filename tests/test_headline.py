@@ -79,6 +79,21 @@ def test_more_than_three_headlines_are_counted_by_verdict_and_the_weakest_is_a_s
     assert words.summary([ONE, worse]) == [words.sentence(ONE), words.sentence(worse)]
 
 
+def test_several_targets_are_named_by_verdict_in_the_words_of_a_single_one() -> None:
+    named = [headline_with(target=target) for target in ("x", "y", "z")]
+    assert words.clause_of_targets(named) == "is better than the best baseline on all 3 targets (12 recordings)"
+    unproven = [dataclasses.replace(headline, clusters=2) for headline in named]
+    assert words.clause_of_targets(unproven) == (
+        "is promising, not proven, on all 3 targets (2 recordings; 6 recordings are needed)"
+    )
+    assert words.judgement(unproven[0]).startswith("promising, not proven")
+    mixed = [named[0], dataclasses.replace(named[1], low=-0.1), dataclasses.replace(unproven[2], gain=-0.1)]
+    assert words.clause_of_targets(mixed).startswith(
+        "is better than the best baseline on x and not measurably different from the best baseline on y and without a "
+    )
+    assert words.clause_of_targets(named[:1]) == words.clause(named[0])
+
+
 def test_gains_in_points_and_areas_have_their_own_words() -> None:
     points = headline_with(measure="points", gain=22.2, low=-2.1, high=43.5)
     assert "net is right 22.2 points more often than ridge" in words.sentence(points)

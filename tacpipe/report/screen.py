@@ -8,21 +8,15 @@ from collections.abc import Sequence
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, listed, number
+from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, number
 from tacpipe.report.blocks import table as table_of
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context
 from tacpipe.scores import headline, words
-from tacpipe.scores.headline import Headline
 from tacpipe.scores.pairing import Gain, Measure
 
 MAX_ROWS = 7  # maximum number of rows in the table
 SHOWN = 4  # number of methods, and of baselines, in a chart
-CLAUSES = {
-    headline.BETTER: "better than",
-    headline.WORSE: "worse than",
-    headline.UNCLEAR: "not measurably different from",
-}
 
 
 def sentence(context: Context) -> tuple[str, str]:
@@ -46,7 +40,8 @@ def sentence(context: Context) -> tuple[str, str]:
         name = "it" if method.name == last_name else method.name
         last_name = method.name
         verdicts += [found.verdict for found in compared]
-        clauses.append(_clause(part, name, compared))
+        where = f"on {part}, " if part else ""
+        clauses.append(f"{where}{name} {words.clause_of_targets(compared)}")
     if not clauses:
         return "", ""
     text = "; ".join(clauses[:2])
@@ -233,26 +228,6 @@ def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> l
     count = [Cell(f"{row.n:,}", value=row.n)] if single else []
     compared = gain_cell(comparison.measure, row.gain) if row.baseline else Cell("")
     return [*(errors[-2:] if single else errors[-1:]), compared, *count]
-
-
-def _clause(part: str, name: str, compared: Sequence[Headline]) -> str:
-    """Return the clause of a sentence on the method ``name`` in a part: its verdict, or those of its targets."""
-    prefix = f"on {part}, " if part else ""
-    if len(compared) == 1:
-        return f"{prefix}{name} {words.clause(compared[0])}"
-    targets_by_verdict: dict[str, list[str]] = {}
-    for found in compared:
-        targets_by_verdict.setdefault(found.verdict, []).append(found.target)
-    counts = []
-    for verdict in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
-        if verdict in targets_by_verdict:
-            is_all = len(targets_by_verdict[verdict]) == len(compared)
-            targets = f"all {len(compared)} targets" if is_all else f"{listed(targets_by_verdict[verdict])}"
-            counts.append(f"{CLAUSES[verdict]} the best baseline on {targets}")
-    size = words.format_count(compared[0].clusters, compared[0].cluster)
-    if not counts:
-        return f"{prefix}{name} was evaluated on {size}, too few for a verdict"
-    return f"{prefix}{name} is {listed(counts)} ({size})"
 
 
 def _capital(text: str) -> str:

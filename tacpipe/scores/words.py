@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from tacpipe.printable import listed
 from tacpipe.scores.headline import BETTER, MIN_CLUSTERS, NO_VERDICT, UNCLEAR, WORSE, Headline, weakest
 
 NONE = "–"
@@ -18,6 +19,13 @@ VERDICTS = {
     UNCLEAR: "no measurable difference",
     NO_VERDICT: "not proven",
 }
+AGAINST = {  # verdicts about several targets
+    BETTER: "better than the best baseline on",
+    UNCLEAR: "not measurably different from the best baseline on",
+    WORSE: "worse than the best baseline on",
+    NO_VERDICT: "without a verdict on",
+}
+PROMISING = "promising, not proven, on"
 CELLS = {**VERDICTS, UNCLEAR: "unclear"}  # verdicts in cells of tables
 SKILL_OVER = "vs "  # column "vs X" contains 1 − error / error of X
 
@@ -63,6 +71,24 @@ def clause(headline: Headline) -> str:
             "area": f"has {gain} area than",
         }
     return f"{verbs[headline.measure]} {name}{among} on {count}: {judgement(headline)}"
+
+
+def clause_of_targets(headlines: Sequence[Headline]) -> str:
+    """Return the predicate of the method for all targets of a part: that of `clause`, or the targets of each verdict."""
+    if len(headlines) == 1:
+        return clause(headlines[0])
+    targets: dict[str, list[str]] = {}
+    for headline in headlines:
+        is_promising = headline.verdict == NO_VERDICT and headline.gain > 0
+        targets.setdefault(PROMISING if is_promising else AGAINST[headline.verdict], []).append(headline.target)
+    parts = []
+    for verdict in (*AGAINST.values(), PROMISING):
+        if verdict in targets:
+            is_all = len(targets[verdict]) == len(headlines)
+            parts.append(f"{verdict} {f'all {len(headlines)} targets' if is_all else listed(targets[verdict])}")
+    unproven = next((headline for headline in headlines if headline.verdict == NO_VERDICT), None)
+    why = f"; {_explain_no_verdict(unproven)}" if unproven else ""
+    return f"is {' and '.join(parts)} ({format_count(headlines[0].clusters, headlines[0].cluster)}{why})"
 
 
 def judgement(headline: Headline) -> str:
