@@ -148,7 +148,7 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
     for part, compared in parts.items():
         method = context.winner(part)
         name = method.name if method else ""
-        heads += [f"{part}: {name}", "best baseline", words.GAINS[compared[0].measure.name]]
+        heads += [f"{part}: {name}" if part else name, "best baseline", words.GAINS[compared[0].measure.name]]
     rows: list[Sequence[str | Cell]] = []
     for target in targets[:MAX_ROWS]:
         cells: list[str | Cell] = [target]
@@ -167,7 +167,7 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
         rows.append(cells)
     measure = next(iter(parts.values()))[0].measure
     return table_of(
-        f"{measure.columns[0]} by target, and {words.GAINS[measure.name]} than the best baseline", heads, rows
+        f"{measure.columns[0][:1].upper()}{measure.columns[0][1:]} by target, next to the best baseline", heads, rows
     )
 
 

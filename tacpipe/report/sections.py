@@ -358,9 +358,10 @@ def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
         counts.append(counted(len(context.methods), "methods"))
     if len(results) > 1:
         counts.append(counted(len(results), "results"))
-    recording_names: set[str] = set()
+    clusters: set[str] = set()
     for run in context.runs:
-        recording_names.update(*(errors.sums.get(MODEL, {}) for errors in run.questions.values()))
-    if recording_names:
-        counts.append(counted(len(recording_names), context.comparisons[0].measure.cluster))
+        for errors in run.questions.values():
+            clusters.update((errors.clusters or {}).get(name, name) for name in errors.sums.get(MODEL, {}))
+    if clusters:
+        counts.append(counted(len(clusters), context.comparisons[0].measure.cluster))
     return counts
