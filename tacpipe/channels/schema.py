@@ -6,6 +6,7 @@ imported only to build tables, because recording does not need it.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Sequence
 from itertools import product
@@ -189,6 +190,23 @@ def is_truth(field: pa.Field) -> bool:
     True
     """
     return field.name.startswith(TRUTH) or (field.metadata or {}).get(TRUTH_KEY.encode()) == b"1"
+
+
+TURNS = {"deg": 360.0, "°": 360.0, "rad": 2 * math.pi}  # a full turn by unit
+ANGLES = ("angle", "joint_position")  # quantities of angles in these units; an orientation is a quaternion
+
+
+def turn_of(field: pa.Field) -> float:
+    """Return a full turn in the unit of a field of angles, otherwise 0.
+
+    >>> import pyarrow as pa
+    >>> turn_of(pa.field("yaw", pa.float64(), metadata={"quantity": "angle", "unit": "deg"}))
+    360.0
+    >>> turn_of(pa.field("force", pa.float64(), metadata={"quantity": "force", "unit": "N"}))
+    0.0
+    """
+    metadata = field_metadata(field)
+    return TURNS.get(metadata.get("unit", ""), 0.0) if metadata.get("quantity") in ANGLES else 0.0
 
 
 def label_field(name: str) -> pa.Field:

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times, from_arrow
-from tacpipe.channels.schema import TRUTH_KEY, field_metadata
+from tacpipe.channels.schema import TRUTH_KEY, field_metadata, turn_of
 from tacpipe.channels.streams import WITHOUT_TRUTH
 from tacpipe.errors import UsageError
 from tacpipe.io.spill import MappedArrays
@@ -28,8 +28,6 @@ from tacpipe.synchronization import streams
 from tacpipe.synchronization.columns import GridColumn
 from tacpipe.synchronization.streams import DEVICE, SEQUENCE, TimedStream
 
-TURNS = {"deg": 360.0, "°": 360.0, "rad": 2 * np.pi}  # a full turn by unit
-ANGLES = ("angle", "joint_position")  # quantities that wrap
 CLOCKS = ("time", "sequence", "mask")  # quantities of columns that describe samples
 Method = Literal["nearest", "linear", "circular", "slerp"]
 
@@ -166,7 +164,7 @@ class TruthColumns:
             elif method == "nearest":
                 yield "nearest", (name,)
             else:
-                yield ("circular" if _turn(schema.field(name)) else "linear"), (name,)
+                yield ("circular" if turn_of(schema.field(name)) else "linear"), (name,)
         for members in quaternions.values():
             order = streams.quaternion_order(self._stream.name, [schema.field(name) for name in members])
             yield "slerp", tuple(members[index] for index in order)
@@ -189,7 +187,7 @@ class TruthColumns:
             kept = np.stack([column[rows] for column in values], axis=1)
             kept = self._storage.keep(make_continuous(kept.astype(np.float64)) if method == "slerp" else kept)
         limit_ns = default_gap_ns(t_ns, self._storage.release) if gap_ms is None else round(gap_ms * 1e6)
-        turn = _turn(self._stream.columns.schema.field(names[0])) if method == "circular" else 0.0
+        turn = turn_of(self._stream.columns.schema.field(names[0])) if method == "circular" else 0.0
         return _Samples(names, method, self._storage.keep(rows), t_ns, kept, limit_ns, turn)
 
     def _blocks(self) -> Iterator[Times]:
@@ -251,9 +249,3 @@ def _nearest(samples: _Samples, grid_ns: Times) -> pa.Array:
         return pa.nulls(len(grid_ns), samples.values.type)
     rows = pa.array(nearest_rows(samples.t_ns, grid_ns), mask=samples.missing(grid_ns))
     return samples.values.take(rows)
-
-
-def _turn(field: pa.Field) -> float:
-    """Return a full turn in the unit of a field of an angle, otherwise 0."""
-    metadata = field_metadata(field)
-    return TURNS.get(metadata.get("unit", ""), 0.0) if metadata.get("quantity") in ANGLES else 0.0

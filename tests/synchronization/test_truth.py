@@ -123,9 +123,10 @@ def test_columns_of_the_stream_that_no_pattern_matches_are_held() -> None:
 
 
 @pytest.mark.parametrize(("unit", "turn"), [("deg", 360.0), ("rad", 2 * np.pi)])
-def test_angles_take_the_shorter_arc(unit: str, turn: float) -> None:
+@pytest.mark.parametrize("quantity", ["angle", "joint_position"])
+def test_angles_take_the_shorter_arc(unit: str, turn: float, quantity: str) -> None:
     angles = np.linspace(0, 3.3 * turn, len(FORCE_MS))
-    tables = {"skin": skin(), "ft": sensor(angle=(angles % turn, schema.float_field("yaw", unit, "angle")))}
+    tables = {"skin": skin(), "ft": sensor(angle=(angles % turn, schema.float_field("yaw", unit, quantity)))}
     t_ms, values = rows_and_values(run(tables), "ft_yaw")
     inside = within(t_ms)
     distance = values[inside] - np.interp(t_ms[inside], FORCE_MS, angles)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Indices, Times
-from tacpipe.channels.schema import field_metadata
+from tacpipe.channels.schema import field_metadata, turn_of
 from tacpipe.datasets.intervals import intervals_of
 from tacpipe.errors import UsageError
 from tacpipe.printable import listed
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
-PERIODS = {"deg": 360.0, "rad": 2 * math.pi}  # unit -> value after which a quantity wraps
-CIRCULAR = ("angle", "orientation")  # quantities whose values wrap in these units
 MAX_CLASSES = 1000  # maximum number of classes that can be learned
 
 
@@ -69,7 +67,6 @@ class Target:
     name: str
     unit: str
     period: float = 0.0  # values wrap after it; 0 if they do not
-    quantity: str = "prediction"
 
 
 @dataclass(frozen=True)
@@ -356,9 +353,9 @@ def _targets_of(recording: Recording, patterns: Sequence[str]) -> dict[str, Targ
             field = schema.field(name)
             if is_number(field.type):
                 about = field_metadata(field)
-                unit, quantity = about.get("unit", ""), about.get("quantity", "")
-                period = PERIODS.get(unit, 0.0) if quantity in CIRCULAR else 0.0
-                targets[name] = Target(name, unit, period, quantity or "prediction")
+                # a joint has a range, and its values outside of a turn are others
+                period = 0.0 if about.get("quantity") == "joint_position" else turn_of(field)
+                targets[name] = Target(name, about.get("unit", ""), period)
     for name, value in recording.attributes.items():
         holds_number = isinstance(value, int | float) and not isinstance(value, bool)
         if name not in targets and holds_number and any(fnmatchcase(name, pattern) for pattern in patterns):
