@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast, TaxelwiseForecast, grid
-from tacpipe.models.lstm import lstm
+from tacpipe.models.lstm import lstm_of_weights, run_layer
 from tacpipe.models.windows import POSE, ForecastWindows
 
 CANDIDATE_WEIGHTS = torch.linspace(0, 1, 21)  # candidate weights; the best is chosen for each step
@@ -111,16 +111,17 @@ class RecurrentForward(nn.Module):
 
         Feeding the head's output z = V h + b back into the gates, U z + W h, is the same as a recurrent weight
         W + U V and a bias U b. So the decoder is an ordinary LSTM over the plan, which one call computes for all
-        steps; only its first step differs, because what is fed back there is measured and not predicted.
+        steps. Only the first step reads what is fed back, where the measured features differ from the predicted ones.
         """
-        from_input, from_state, *biases = self.encoder.parameters()
-        _, state = lstm(past, None, (from_input, from_state, biases[0] + biases[1]))
+        state = run_layer(self.encoder, past)[1]
         from_input, from_state, *biases = self.decoder.parameters()
-        feedback, from_plan = from_input.tensor_split([self.latents], dim=1)  # (gate, latent), (gate, state)
-        measured = past[-1, :, : self.latents] - self.head(state[0])  # (window, latent)
+        feedback = from_input[:, : self.latents]  # (gate, latent)
+        measured = past[-1, :, : self.latents] - self.head(state[0][0])  # (window, latent)
+        later = measured.new_zeros(len(plan) - 1, *measured.shape)
+        inputs = torch.cat([torch.cat([measured[None], later]), plan], -1)
         recurrent = torch.addmm(from_state, feedback, self.head.weight)
         bias = biases[0] + biases[1] + feedback @ self.head.bias
-        states, _ = lstm(plan, state, (from_plan, recurrent, bias), (measured, feedback))
+        states = lstm_of_weights(inputs, state, (from_input, recurrent, bias))
         predicted: Tensor = self.head(states)
         return predicted
 

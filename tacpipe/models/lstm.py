@@ -1,4 +1,4 @@
-"""Recurrent layers: torch's LSTM of given weights, and layers in float32 on a GPU.
+"""Recurrent layers: torch's layers in float32 under autocast, and an LSTM of computed weights.
 
 Hochreiter and Schmidhuber, Long Short-Term Memory (Neural Computation 1997), with the forget gate of Gers, Schmidhuber
 and Cummins, Learning to Forget (Neural Computation 2000), in torch's order of gates i, f, g, o.
@@ -44,32 +44,20 @@ def _to_float32(value: Any) -> Any:
 
 # computed weights are not contiguous, so cuDNN copies them in every call
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
-State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
+State = tuple[Tensor, Tensor]  # h and c, each (1, window, hidden)
 Weights = tuple[Tensor, Tensor, Tensor]  # W (4 hidden, input), R (4 hidden, hidden), b (4 hidden,)
-Lead = tuple[Tensor, Tensor]  # inputs of the first step only (window, more), and their columns of W (4 hidden, more)
 
 
-def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None = None) -> tuple[Tensor, State]:
-    """Return h of all steps (step, window, hidden) and the last state, for ``inputs`` (step, window, input).
+def lstm_of_weights(inputs: Tensor, state: State, weights: Weights) -> Tensor:
+    """Return h of all steps (step, window, hidden) of an LSTM with ``weights``, for ``inputs`` (step, window, input).
 
-    The initial state is zero if ``state`` is None. ``lead`` adds inputs of the first step only. The result is in float32
-    also under autocast.
+    The result is in float32 also under autocast.
     """
-    return _in_float32(_torch_lstm, inputs, state, weights, lead)
+    return _in_float32(_torch_lstm, inputs, state, weights)
 
 
-def _torch_lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | None) -> tuple[Tensor, State]:
-    """Return the result of `lstm` in the type of the inputs."""
-    from_input, from_state, bias = weights
-    all_inputs = inputs
-    if lead is not None:  # these inputs are zero after the first step
-        lead_inputs = torch.cat([lead[0][None], lead[0].new_zeros(len(inputs) - 1, *lead[0].shape)])
-        all_inputs = torch.cat([lead_inputs, inputs], dim=-1)
-        from_input = torch.cat([lead[1], from_input], dim=1)
-    zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
-    first_hidden, first_cell = (zero, zero) if state is None else state
-    flat = [from_input, from_state, bias, torch.zeros_like(bias)]
-    states, hidden, cell = torch.lstm(
-        all_inputs, (first_hidden[None], first_cell[None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
-    )
-    return states, (hidden[0], cell[0])
+def _torch_lstm(inputs: Tensor, state: State, weights: Weights) -> Tensor:
+    """Return the result of `lstm_of_weights` in the type of the inputs."""
+    flat = [*weights, torch.zeros_like(weights[2])]
+    states: Tensor = torch.lstm(inputs, state, flat, True, 1, 0.0, torch.is_grad_enabled(), False, False)[0]
+    return states

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.lstm import lstm
+from tacpipe.models.lstm import run_layer
 
 GRID = (6, 10)  # triangles of a RoboSkin patch and taxels per triangle
 WIDTH = 18  # features of a header: the output size of the convolution, also used for the perceptron
@@ -205,7 +205,7 @@ class RecurrentAutoencoder(nn.Module):
 
     def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
         """Return the output for slides ``frames`` (time, slide, channel); without ``decode``, its frames are None."""
-        last = _run_layer(self.encoder, self.header.encode(frames))[-1]  # (slide, hidden)
+        last = run_layer(self.encoder, self.header.encode(frames))[0][-1]  # (slide, hidden)
         latents = self.to_latents(last)
         return NetworkOutput(latents, self.classify(latents), self._decode(latents, len(frames)) if decode else None)
 
@@ -219,9 +219,9 @@ class RecurrentAutoencoder(nn.Module):
         initial = self.from_latents(latents)  # (slide, hidden)
         if self.shape.decoder == "D1":
             zeros = initial.new_zeros(steps, len(initial), 1)
-            states = _run_layer(self.decoder, zeros, initial)
+            states, _ = run_layer(self.decoder, zeros, (initial[None], torch.zeros_like(initial)[None]))
         else:
-            states = _run_layer(self.decoder, initial.expand(steps, *initial.shape))
+            states, _ = run_layer(self.decoder, initial.expand(steps, *initial.shape))
         return self.header.decode(self.to_features(states))
 
 
@@ -240,21 +240,13 @@ class RecurrentClassifier(nn.Module):
 
     def forward(self, frames: Tensor, *, decode: bool = True) -> NetworkOutput:
         """Return the output for slides ``frames`` (time, slide, channel), without frames."""
-        last = _run_layer(self.encoder, self.header.encode(frames))[-1]
+        last = run_layer(self.encoder, self.header.encode(frames))[0][-1]
         return NetworkOutput(last, self.classify(last), None)
 
     def classify(self, latents: Tensor) -> Tensor:
         """Return the scores (slide, class) of last states (slide, hidden)."""
         scores: Tensor = self.classifier(nn.functional.dropout(latents, self.shape.dropout, self.training))
         return scores
-
-
-def _run_layer(layer: nn.LSTM, inputs: Tensor, hidden: Tensor | None = None) -> Tensor:
-    """Return the states (time, slide, hidden) of a layer. The initial cell is zero, and so is h if ``hidden`` is None."""
-    from_input, from_state, *biases = layer.parameters()  # torch has two biases, and adds them
-    state = None if hidden is None else (hidden, torch.zeros_like(hidden))
-    states, _ = lstm(inputs, state, (from_input, from_state, biases[0] + biases[1]))
-    return states
 
 
 class PlainClassifier(nn.Module):

@@ -25,7 +25,7 @@ class ForwardTask(Task):
     requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=8)
+    @stage(version=9)
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 

@@ -90,7 +90,7 @@ class MaterialTask(Task):
     requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=2)
+    @stage(version=3)
     def train(
         params: Params, train: Dataset, val: Dataset | None, workspace: Workspace, init: Model | None = None
     ) -> Result:
