@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from tacpipe.arrays import AnyFloats, Float32s, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.io import terminal
+from tacpipe.io import Json, terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import RecordingOutput, Result
@@ -26,7 +26,6 @@ from tacpipe.tasks.forward.headline import (
     BASELINE,
     MODEL,
     QuantileMeasures,
-    QuantileMetrics,
     look_ahead_notes,
     unit_of_model,
 )
@@ -78,15 +77,19 @@ class QuantileSums:
             if drawn is not None:
                 self.examples.append(drawn.example(uncertainty.percents))
 
-    def summary(self, trials: Sequence[Trial]) -> QuantileMetrics | None:
-        """Return the quantile measures of each predictor, or None if the model has no quantiles."""
+    def summary(self, trials: Sequence[Trial]) -> Json:
+        """Return the part ``quantiles`` of ``metrics.json``: the quantile measures of each predictor.
+
+        They are of recordings that the model has not seen, followed by those of the parts of `metrics.divide`. Empty if
+        the model has no quantiles.
+        """
         uncertainty = self.forecaster.quantiles
         if uncertainty is None:
-            return None
+            return {}
         fresh, parts = metrics.divide([trial for trial in trials if trial.name in self.sums])
-        described = self.forecaster.config["quantiles"]
         measures = {name: self._measures(part, uncertainty.percents) for name, part in parts.items() if part}
-        return QuantileMetrics(described, self._measures(fresh, uncertainty.percents) if fresh else {}, measures)
+        unseen = self._measures(fresh, uncertainty.percents) if fresh else {}
+        return {**self.forecaster.config["quantiles"], **unseen, **measures}
 
     def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
         """Return the measures of each predictor by step, with intervals over recordings, or unseen objects."""
@@ -228,18 +231,17 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             del track
             advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
-    measured = replace(
-        metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale),
-        situations=by_situation.summary(),
-        quantiles=bands.summary(trials),
-    )
+    scores, parts = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
+    further = {"situations": by_situation.summary(), "quantiles": bands.summary(trials), "rest_shift": shifts}
+    measured = {**scores.to_json(), **{name: part.to_json() for name, part in parts.items()}}
+    measured |= {name: values for name, values in further.items() if values}
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
             metrics.headline(method, trials, forecaster.horizon, unit_of_model(forecaster.config))
         ),
-        "metrics.json": model_files.to_json({**measured.to_json(), **({"rest_shift": shifts} if shifts else {})}),
-        "horizons.csv": metrics.horizons_csv(measured.fresh.predictors, forecaster.config["rate_hz"]),
+        "metrics.json": model_files.to_json(measured),
+        "horizons.csv": metrics.horizons_csv(scores.predictors, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
         **bands.files(trials),

@@ -231,37 +231,25 @@ class Forecaster:
             if any(values.shape != (1, self.horizon, touch.shape[2]) for values in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
 
-    def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
-        """Return predicted counts above rest from arrays; see `prediction.ForwardModel.predict`.
+    def predict_windows(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int] = ()) -> AnyFloats:
+        """Return predicted counts above rest from arrays, or their quantiles; see `prediction.ForwardModel.predict`.
 
         Arrays without the axis of windows are one window. Raises `TacpipeError` if shapes or values do not fit the
-        model.
+        model, or it lacks a quantile of ``percents``.
         """
+        at = self.quantiles_of(percents)[1] if percents else []
         single = np.ndim(window) == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         predicted = self._predict_arrays(touch, arm, finger)
+        if percents:
+            windows = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
+            predicted = self.forecast_quantiles(windows, touch[:, -self.context :], predicted)[..., at]
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
         """Return the quantiles, and the indices of ``percents`` among them; see `tacpipe.tasks.task.quantiles_of`."""
         return quantiles_of(self.quantiles, percents)
-
-    def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
-        """Return quantiles of counts above rest from arrays; see `prediction.ForwardModel.predict`.
-
-        Arrays without the axis of windows are one window. Raises `TacpipeError` if shapes or values do not fit the
-        model, or it lacks a quantile of ``percents``.
-        """
-        _, at = self.quantiles_of(percents)
-
-        single = np.ndim(window) == 2
-        touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
-        self._check_levels(touch)
-        ahead = self._predict_arrays(touch, arm, finger)
-        windows = ForecastWindows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
-        quantiles = self.forecast_quantiles(windows, touch[:, -self.context :], ahead)[..., at]
-        return quantiles[0] if single else quantiles
 
     def error_features(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return the `window_features` of windows, from which the uncertainty of a forecast is computed.

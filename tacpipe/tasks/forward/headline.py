@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NotRequired, Self, TypedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tacpipe.scores.pairing import Measure, Sums
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.tasks.forward.params import ForwardConfig, QuantileDescription
+    from tacpipe.tasks.forward.params import ForwardConfig
 
 COUNT, COUNTS = "count", "counts"  # unit in column names and in text
 MIXED = "own units"  # unit if channels or models differ
@@ -141,42 +141,9 @@ class ForwardScores:
     predictors: dict[str, PredictorScores]  # empty if no recording has a window
     skill: dict[str, IntervalsByStep]  # of the model relative to persistence, by measure
 
-    @classmethod
-    def from_json(cls, stored: Json) -> Self:
-        """Create the scores from ``metrics.json`` or one of its parts."""
-        scored = {name: value for name, value in stored.items() if name != "skill" and "mse_counts" in value}
-        return cls(stored["counts"], scored, stored.get("skill", {}))
-
     def to_json(self) -> Json:
-        """Return the scores in the form that `from_json` reads."""
+        """Return ``metrics.json`` or one of its parts."""
         return {"counts": self.counts, **self.predictors, **({"skill": self.skill} if self.skill else {})}
-
-
-@dataclass(frozen=True)
-class QuantileMetrics:
-    """Metrics of a calibrated model's quantiles."""
-
-    description: QuantileDescription
-    fresh: dict[str, QuantileMeasures]  # on recordings that the model has not seen, by predictor
-    parts: dict[str, dict[str, QuantileMeasures]]
-
-    @classmethod
-    def from_json(cls, stored: Json) -> Self:
-        """Create the metrics from the output of `to_json`."""
-        parts = {name: stored[name] for name in METRIC_PARTS if name in stored}
-        described = ("levels", "method", "recordings", "most_promised")
-        fresh = {name: value for name, value in stored.items() if name not in (*parts, *described)}
-        description: QuantileDescription = {
-            "levels": stored["levels"],
-            "method": stored["method"],
-            "recordings": stored["recordings"],
-            "most_promised": stored["most_promised"],
-        }
-        return cls(description, fresh, parts)
-
-    def to_json(self) -> Json:
-        """Return the ``quantiles`` part of ``metrics.json``."""
-        return {**self.description, **self.fresh, **self.parts}
 
 
 class SituationMeasures(TypedDict):
@@ -186,42 +153,6 @@ class SituationMeasures(TypedDict):
     recordings: int
     mae_counts: dict[str, dict[str, float]]  # by predictor and step
     skill: dict[str, dict[str, float]]  # mean, lower and upper bound by step
-
-
-# recordings of known objects, of unseen objects, and recordings that the model has seen
-METRIC_PARTS = ("known", "unseen", "seen")
-
-
-@dataclass(frozen=True)
-class ForwardMetrics:
-    """Content of ``metrics.json`` in a forecast evaluation."""
-
-    fresh: ForwardScores  # on recordings that the model has not seen
-    parts: dict[str, ForwardScores]  # by each of `METRIC_PARTS` that contains recordings
-    situations: dict[str, SituationMeasures] = field(default_factory=dict)
-    quantiles: QuantileMetrics | None = None
-    live: LiveMetrics | None = None
-
-    @classmethod
-    def from_json(cls, stored: Json) -> Self:
-        """Create the metrics from the output of `to_json`."""
-        return cls(
-            ForwardScores.from_json(stored),
-            {name: ForwardScores.from_json(stored[name]) for name in METRIC_PARTS if name in stored},
-            stored.get("situations", {}),
-            QuantileMetrics.from_json(stored["quantiles"]) if "quantiles" in stored else None,
-            stored.get("live"),
-        )
-
-    def to_json(self) -> Json:
-        """Return the content of ``metrics.json`` without metrics that were not computed."""
-        optional = {
-            "situations": self.situations,
-            "quantiles": self.quantiles and self.quantiles.to_json(),
-            "live": self.live,
-        }
-        parts = {name: scores.to_json() for name, scores in self.parts.items()}
-        return {**self.fresh.to_json(), **parts, **{name: value for name, value in optional.items() if value}}
 
 
 @dataclass(frozen=True)

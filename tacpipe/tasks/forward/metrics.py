@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -22,13 +22,14 @@ from tacpipe.tasks.forward.headline import (
     BASELINE,
     COUNTS,
     MODEL,
-    ForwardMetrics,
     ForwardScores,
     IntervalsByStep,
     PredictorScores,
     WindowCounts,
 )
-from tacpipe.tasks.forward.predictors import Prediction
+
+if TYPE_CHECKING:  # this module imports torch
+    from tacpipe.tasks.forward.predictors import Prediction
 
 Masks = Mapping[str, Bools]  # mask (channel,) by name of the channel group
 
@@ -129,18 +130,16 @@ def divide(trials: Sequence[Trial]) -> tuple[list[Trial], dict[str, list[Trial]]
     return fresh, {**(by_object if all(by_object.values()) else {}), "seen": [trial for trial in trials if trial.seen]}
 
 
-def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> ForwardMetrics:
-    """Return the metrics of all predictors.
+def summary(
+    trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats
+) -> tuple[ForwardScores, dict[str, ForwardScores]]:
+    """Return the scores of all predictors on recordings that the model has not seen, and those of the parts of `divide`.
 
-    ``channel_scale`` (channel,) is each channel's standard deviation in training. Recordings that the model has not
-    seen are in ``fresh``, and those that it has seen in ``seen``. If there are recordings of both known and new
-    objects, ``known`` and ``unseen`` contain the two subsets of ``fresh``.
+    ``channel_scale`` (channel,) is each channel's standard deviation in training. Parts without recordings are left out.
     """
     fresh, parts = divide(trials)
-    return ForwardMetrics(
-        _scores(fresh, groups, horizon, channel_scale),
-        {name: _scores(part, groups, horizon, channel_scale) for name, part in parts.items() if part},
-    )
+    by_part = {name: _scores(part, groups, horizon, channel_scale) for name, part in parts.items() if part}
+    return _scores(fresh, groups, horizon, channel_scale), by_part
 
 
 def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
@@ -287,22 +286,31 @@ def _scores(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
         if feature:
             predictors[name]["mse_feature"] = _steps(np.stack(feature), windows)
     units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
-    kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
     skill = {
-        measure: _intervals(
-            _error_sums_by_step(evaluated, MODEL, attribute), _error_sums_by_step(evaluated, BASELINE, attribute), units
+        measure: skill_by_step(
+            interval,
+            _error_sums_by_step(evaluated, MODEL, attribute),
+            _error_sums_by_step(evaluated, BASELINE, attribute),
+            units,
         )
-        for measure, attribute in kinds.items()
+        for measure, attribute, interval in (
+            ("mse_counts", "count_squared", intervals.skill_interval),
+            ("mae_counts", "count_absolute", intervals.skill_interval),
+            ("mse_feature", "feature_squared", intervals.skill_interval),
+            (headlines.GEOMETRIC, "count_absolute", intervals.geometric_skill_interval),
+        )
     }
-    model, persistence = (_error_sums_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
-    skill[headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
     return ForwardScores(counts, predictors, skill)
 
 
 def _steps(sums: AnyFloats, windows: Int64s) -> dict[str, float]:
     """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
-    error = regression.mean_error(sums, windows)
-    return {f"t{step}": _round(value) for step, value in enumerate(error, 1)} | {"mean": _round(error.mean())}
+    return by_step(regression.mean_error(sums, windows))
+
+
+def by_step(errors: AnyFloats) -> dict[str, float]:
+    """Return errors (step,) by the names of their steps, and their mean."""
+    return {f"t{step}": _round(value) for step, value in enumerate(errors, 1)} | {"mean": _round(errors.mean())}
 
 
 def _group_errors(sums: AnyFloats, windows: Int64s, groups: Masks) -> dict[str, dict[str, float]]:
@@ -315,27 +323,20 @@ def _error_sums_by_step(trials: Sequence[Trial], predictor: str, attribute: str)
     return np.stack([getattr(trial.errors[predictor], attribute).sum(axis=1) for trial in trials])
 
 
-def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
+def skill_by_step(
+    interval: Callable[..., Interval], model: AnyFloats, baseline: AnyFloats, clusters: AnyArray | None = None
+) -> IntervalsByStep:
     """Return skill with intervals over clusters by step and over all steps, from sums (recording, step).
 
-    ``clusters`` (recording,) are the units that are resampled. Undefined values are omitted.
+    ``interval`` is a function of `tacpipe.scores.intervals`, and ``clusters`` (recording,) are the units that are
+    resampled, by default recordings. Undefined values are omitted.
     """
-    wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
-    return _intervals_by_step(intervals.skill_interval(wide[0], wide[1], clusters))
-
-
-def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
-    """Return skill from the geometric mean of absolute error ratios (recording, step), as `_intervals_by_step` does."""
-    wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
-    return _intervals_by_step(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
-
-
-def _intervals_by_step(interval: Interval) -> IntervalsByStep:
-    """Return values with their intervals by step and over all steps, without undefined ones."""
-    names = [f"t{step}" for step in range(1, len(interval.mean))] + ["mean"]
+    with_total = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
+    skill = interval(*with_total, clusters)
+    names = [f"t{step}" for step in range(1, len(skill.mean))] + ["mean"]
     tree: IntervalsByStep = {}
     for index, name in enumerate(names):
-        ends = {part: float(getattr(interval, part)[index]) for part in ("mean", "low", "high")}
+        ends = {part: float(getattr(skill, part)[index]) for part in ("mean", "low", "high")}
         tree[name] = {part: _round(value) for part, value in ends.items() if math.isfinite(value)}
     return {name: ends for name, ends in tree.items() if ends}
 

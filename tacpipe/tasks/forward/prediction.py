@@ -186,8 +186,7 @@ class ForwardModel(Forecaster):
         twice `largest_level` is not detected.
         """
         if plan is not None:
-            window = cast("AnyFloats", data)
-            return self.predict_quantiles(window, plan, quantiles) if quantiles else self.predict_windows(window, plan)
+            return self.predict_windows(cast("AnyFloats", data), plan, quantiles)
         recordings = open_for_model(cast("Dataset | Recording", data), self.chain)
         return one_after_another(tables(self, recordings, sorted(set(steps)), sorted(set(quantiles))))
 

@@ -5,7 +5,6 @@ Situations depend on a window's last input row and its future rows, so they desc
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,6 +14,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.scores import intervals, regression
 from tacpipe.tasks.forward.headline import BASELINE, MODEL, SituationMeasures
+from tacpipe.tasks.forward.metrics import by_step, skill_by_step
 
 if TYPE_CHECKING:  # these modules import torch, which a report does not need
     from tacpipe.tasks.forward.predictors import Prediction
@@ -122,29 +122,13 @@ class BySituation:
         count = sum(int(self.windows[name][index]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
         errors = {name: self._sums(self.absolute, recordings, name, index).sum(axis=0) for name in predictors}
-        model, persistence = (
-            np.hstack([sums, sums.sum(axis=1, keepdims=True)])
-            for sums in (self._sums(self.absolute, recordings, name, index) for name in (MODEL, BASELINE))
-        )
-        interval = intervals.geometric_skill_interval(model, persistence)
-        skill: dict[str, dict[str, float]] = {}
-        for position, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"]):
-            bounds = {name: getattr(interval, name)[position] for name in ("mean", "low", "high")}
-            skill[step] = {name: _round(value) for name, value in bounds.items() if math.isfinite(value)}
+        model, persistence = (self._sums(self.absolute, recordings, name, index) for name in (MODEL, BASELINE))
         return {
             "windows": count,
             "recordings": len(recordings),
-            "mae_counts": {name: _steps(values / (count * self.channels)) for name, values in errors.items()},
-            "skill": {step: values for step, values in skill.items() if values},
+            "mae_counts": {name: by_step(values / (count * self.channels)) for name, values in errors.items()},
+            "skill": skill_by_step(intervals.geometric_skill_interval, model, persistence),
         }
 
     def _sums(self, sums: dict[tuple[str, str], AnyFloats], recordings: Sequence[str], name: str, at: int) -> AnyFloats:
         return np.stack([sums[recording, name][at] for recording in recordings])
-
-
-def _steps(errors: AnyFloats) -> dict[str, float]:
-    return {f"t{step}": _round(value) for step, value in enumerate(errors, 1)} | {"mean": _round(errors.mean())}
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.9g}")
