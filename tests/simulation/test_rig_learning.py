@@ -201,7 +201,7 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     ahead = np.full_like(track.tactile, np.nan)
     for batch in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-        ahead[batch.now] = batch.predictions[MODEL].count[:, -1]
+        ahead[batch.forecast.now] = batch.predictions[MODEL].count[:, -1]
     felt = pull_over_pressure(track.tactile[:])
     pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
     pressure = floats(shard, "gt_finger1_normal_n") + floats(shard, "gt_finger2_normal_n")

@@ -30,7 +30,7 @@ from tacpipe.tasks.forward.headline import (
     unit_of_model,
 )
 from tacpipe.tasks.forward.metrics import Trial
-from tacpipe.tasks.forward.predictors import WindowForecast, forecasts, iterate_predictions
+from tacpipe.tasks.forward.predictors import WindowForecast, iterate_predictions
 from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.tracks import Track
@@ -52,30 +52,27 @@ class QuantileSums:
 
     forecaster: Forecaster
     sums: dict[str, dict[str, Sums]] = field(default_factory=dict)  # sums by predictor, by recording
-    examples: list[dict[str, str | int | list[float]]] = field(default_factory=list)  # see `_Drawn.example`
+    drawn: dict[str, _Drawn] = field(default_factory=dict)  # by recording
 
-    def add(self, track: Track, trial: Trial) -> None:
-        """Add the windows of a recording; nothing if the model has no quantiles."""
+    def add(self, track: Track, trial: Trial, forecast: WindowForecast) -> None:
+        """Add some windows of a recording; nothing if the model has no quantiles."""
         forecaster = self.forecaster
         uncertainty = forecaster.quantiles
         if uncertainty is None:
             return
-        drawn = _Drawn(forecaster, track) if not trial.seen and len(self.examples) < SHOWN else None
-        sums: dict[str, Sums] = {}
-        for forecast in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            for part in _parts(len(forecast.count)):
-                truth = track.tactile[forecast.future[part]]
-                for name, quantiles_ahead in _predict_quantiles(forecaster, uncertainty, track, forecast, part):
-                    flat = quantiles_ahead.transpose(0, 2, 1, 3).reshape(-1, truth.shape[1], len(uncertainty.percents))
-                    true = truth.transpose(0, 2, 1).reshape(-1, truth.shape[1])
-                    part_sums = Sums.from_predictions(true, flat, uncertainty.errors.levels)
-                    sums[name] = sums[name] + part_sums if name in sums else part_sums
-                    if drawn is not None and name == MODEL:
-                        drawn.add(forecast.now[part], truth, quantiles_ahead)
-        if sums:
-            self.sums[trial.name] = sums
-            if drawn is not None:
-                self.examples.append(drawn.example(uncertainty.percents))
+        if trial.name not in self.sums and not trial.seen and len(self.drawn) < SHOWN:
+            self.drawn[trial.name] = _Drawn(forecaster, track)
+        sums = self.sums.setdefault(trial.name, {})
+        for first in range(0, len(forecast.count), CHUNK):
+            part = slice(first, first + CHUNK)
+            truth = track.tactile[forecast.future[part]]
+            for name, quantiles_ahead in _predict_quantiles(forecaster, uncertainty, track, forecast, part):
+                flat = quantiles_ahead.transpose(0, 2, 1, 3).reshape(-1, truth.shape[1], len(uncertainty.percents))
+                true = truth.transpose(0, 2, 1).reshape(-1, truth.shape[1])
+                part_sums = Sums.from_predictions(true, flat, uncertainty.errors.levels)
+                sums[name] = sums[name] + part_sums if name in sums else part_sums
+                if name == MODEL and trial.name in self.drawn:
+                    self.drawn[trial.name].add(forecast.now[part], truth, quantiles_ahead)
 
     def summary(self, trials: Sequence[Trial]) -> Json:
         """Return the part ``quantiles`` of ``metrics.json``: the quantile measures of each predictor.
@@ -113,7 +110,8 @@ class QuantileSums:
 
         Empty if the model has no quantiles.
         """
-        if self.forecaster.quantiles is None:
+        uncertainty = self.forecaster.quantiles
+        if uncertainty is None:
             return {}
         rows = []
         for trial in trials:
@@ -133,8 +131,9 @@ class QuantileSums:
                         "pinball": sums.pinball[index].mean(),
                     }
                     rows.append(row)
-        drawn = (json.dumps(self.examples) + "\n").encode()
-        return {COVERAGE_FILE: to_parquet(pa.Table.from_pylist(rows, _COLUMNS)), EXAMPLES: drawn}
+        examples = [drawn.example(uncertainty.percents) for drawn in self.drawn.values()]
+        drawn_bytes = (json.dumps(examples) + "\n").encode()
+        return {COVERAGE_FILE: to_parquet(pa.Table.from_pylist(rows, _COLUMNS)), EXAMPLES: drawn_bytes}
 
 
 _COLUMNS = pa.schema(
@@ -163,10 +162,6 @@ def _predict_quantiles(
     yield UNCONDITIONAL, forecast.count[part][..., None] + uncertainty.unconditional.transpose(2, 1, 0)
     last = track.tactile[forecast.now[part]]
     yield BASELINE, last[:, None, :, None] + uncertainty.persistence.transpose(2, 1, 0)
-
-
-def _parts(windows: int) -> Iterator[slice]:
-    return (slice(first, first + CHUNK) for first in range(0, windows, CHUNK))
 
 
 class _Drawn:
@@ -221,13 +216,12 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
                 name, shard.digest in seen_digests, track.object, track.object is None or track.object in objects
             )
             attributes = {**shard.attributes, "seen": trial.seen}
-            rows = _predictions(forecaster, track, trial, by_situation, spill)
+            rows = _predictions(forecaster, track, trial, by_situation, bands, spill)
             outputs[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
             shift = levels and rest_shift.measure_shift(rest_shift.rest_level(shard, forecaster.codec.channels), levels)
             if shift and not trial.seen:
                 shifts[name] = shift
-            bands.add(track, trial)
             del track
             advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
@@ -259,12 +253,13 @@ def _predictions(
     track: Track,
     trial: Trial,
     by_situation: BySituation,
+    bands: QuantileSums,
     spill: Spill,
 ) -> pa.Table | pa.RecordBatchReader:
     """Return the predictions for all windows of a recording, spilled to ``spill``; adds its errors to ``trial``.
 
-    If the model has not seen the recording, adds its errors by situation to ``by_situation``. Only some windows, and of
-    each one predictor, are in memory at a time.
+    Adds its quantiles to ``bands`` and, if the model has not seen the recording, its errors by situation to
+    ``by_situation``. Only some windows, and of each one predictor, are in memory at a time.
     """
     starts = track.starts(forecaster.context, forecaster.horizon)
     track.count_rows(starts, forecaster.context + forecaster.horizon)
@@ -272,16 +267,18 @@ def _predictions(
     no_windows = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, no_windows))
     for windows in iterate_predictions(forecaster, track, starts):
-        trial.windows += len(windows.now)
-        doing = situations.window_situations(track, windows.now, forecaster.horizon)
+        now = windows.forecast.now
+        trial.windows += len(now)
+        doing = situations.window_situations(track, now, forecaster.horizon)
         if not trial.seen:
             by_situation.count(trial.name, doing)
         for name, prediction in windows.predictions.items():
             trial.add_errors(name, prediction, windows.truth, forecaster.feature_half)
             if not trial.seen:
                 by_situation.add(trial.name, doing, name, prediction, windows.truth)
-        stored = windows.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
-        gathered.add(_prediction_table(forecaster, track, windows.now, steps, np.ascontiguousarray(stored)))
+        bands.add(track, trial, windows.forecast)
+        stored = windows.forecast.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
+        gathered.add(_prediction_table(forecaster, track, now, steps, np.ascontiguousarray(stored)))
         del windows, stored  # frees the memory for the next windows
     return gathered.rows()
 

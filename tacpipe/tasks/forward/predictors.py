@@ -33,16 +33,6 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Predicted:
-    """Some windows of a recording with the measured signals and each predictor's predictions."""
-
-    now: Int64s  # (window,), last input row
-    features: AnyFloats  # (window, step, feature), as the model represents them
-    truth: Prediction
-    predictions: Mapping[str, Prediction]  # `items` computes them one by one, so that not all are in memory at once
-
-
-@dataclass(frozen=True)
 class WindowForecast:
     """Some windows of a recording with only the model's predictions."""
 
@@ -56,6 +46,15 @@ class WindowForecast:
     def now(self) -> Int64s:
         """Last input row (window,)."""
         return self.past[:, -1]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Some windows of a recording with the measured signals and each predictor's predictions."""
+
+    forecast: WindowForecast
+    truth: Prediction
+    predictions: Mapping[str, Prediction]  # `items` computes them one by one, so that not all are in memory at once
 
 
 def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[WindowForecast]:
@@ -84,7 +83,7 @@ def iterate_predictions(forecaster: Forecaster, track: Track, starts: Int64s) ->
     """Yield all predictors' predictions for the windows of ``track`` that start at ``starts``, in batches."""
     for forecast in forecasts(forecaster, track, starts):
         truth = Prediction(track.latent[forecast.future], track.tactile[forecast.future])
-        yield Predicted(forecast.now, forecast.features, truth, _Predictions(forecaster, track, forecast))
+        yield Predicted(forecast, truth, _Predictions(forecaster, track, forecast))
         del forecast, truth  # frees the memory for the next windows
 
 

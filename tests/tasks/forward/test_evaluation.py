@@ -345,7 +345,7 @@ def test_predictions_stand_at_the_time_they_are_known(model: dict[str, bytes]) -
         f"{name}_t1",
         f"{name}_t3",
     ]
-    assert np.allclose(predictions[f"{name}_t3"].to_numpy(), windows.features[:, 2, 0], rtol=1e-5)
+    assert np.allclose(predictions[f"{name}_t3"].to_numpy(), windows.forecast.features[:, 2, 0], rtol=1e-5)
     assert np.allclose(predictions[name].to_numpy(), counts(TEST[0])[4:-4, 0], atol=1e-2)
 
 

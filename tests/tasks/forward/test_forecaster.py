@@ -93,7 +93,7 @@ def test_predict_says_what_is_judged(
     assert predicted.shape == (72, HORIZON, len(CHANNELS))
     assert predicted.dtype == np.float64
     assert np.allclose(predicted, windows_predicted.predictions["model"].count, atol=0.05)
-    assert np.abs(predicted - recorded.tactile[windows_predicted.now][:, None]).max() > 5
+    assert np.abs(predicted - recorded.tactile[windows_predicted.forecast.now][:, None]).max() > 5
 
 
 def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_window(
@@ -107,7 +107,7 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
     assert np.allclose(predicted[0], expected[0], atol=0.05)
     assert (
         np.abs(predicted - expected).mean()
-        < 0.2 * np.abs(predicted - recorded.tactile[windows_predicted.now][:, None]).mean()
+        < 0.2 * np.abs(predicted - recorded.tactile[windows_predicted.forecast.now][:, None]).mean()
     )
 
 

@@ -23,8 +23,9 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     shard: FakeShard = motion(0, rows=rows)
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     by_situation = BySituation(forecaster.horizon, len(forecaster.codec.channels))
+    bands = evaluation.QuantileSums(forecaster)
     tracemalloc.start()
-    evaluation._predictions(forecaster, track, Trial("a", True), by_situation, Spill(1))
+    evaluation._predictions(forecaster, track, Trial("a", True), by_situation, bands, Spill(1))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
