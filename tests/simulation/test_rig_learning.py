@@ -268,7 +268,7 @@ def predicted_counts(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, 
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     parts = list(iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
     counts = np.concatenate([batch.predictions[MODEL].count for batch in parts])
-    return np.concatenate([batch.now for batch in parts]), counts
+    return np.concatenate([batch.forecast.now for batch in parts]), counts
 
 
 def from_row(shard: FakeShard, row: int, values: AnyFloats | float) -> AnyFloats:
