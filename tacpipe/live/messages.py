@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -37,6 +38,25 @@ class Message:
     age_ms: float = math.nan
     compute_ms: float = math.nan
     flags: int = 0
+    sent_ns: int = 0  # time of publishing, on the clock of ``t_ns``
+    offset_ns: int = time.time_ns() - time.monotonic_ns()  # from the monotonic clock to that of ``t_ns``
+
+    @property
+    def arrived_ns(self) -> int | None:
+        """Arrival of the newest sample, or request, that the answer uses; None without an answer."""
+        return self.made_from_t_ns if self.answers and self.made_from_t_ns else None
+
+    @property
+    def sampled_ns(self) -> int | None:
+        """When that sample was measured: its arrival, or the time of its row if that is earlier.
+
+        None without an answer. Subclasses also return None for answers about no moment, such as those to a request.
+        """
+        return None if self.arrived_ns is None else min(self.arrived_ns, self.t_ns)
+
+    def stamp(self, now_ns: int, offset_ns: int) -> None:
+        """Write the time of publishing, given on the monotonic clock."""
+        self.sent_ns, self.offset_ns = now_ns + offset_ns, offset_ns
 
     @property
     def answers(self) -> bool:
@@ -138,6 +158,14 @@ def head_values() -> tuple[Value, ...]:
     return (
         Value("seq", "number of the message, from 1", "integer"),
         Value("t_ns", "time of the predicted row, slide or request, UTC", "integer", unit="ns"),
+        Value(
+            "sampled_ns",
+            "when the newest used sample was measured, on the clock of `t_ns`; null: no answer, or about no moment",
+            "integer",
+            unit="ns",
+        ),
+        Value("arrived_ns", "when that sample, or the request, arrived; null: no answer", "integer", unit="ns"),
+        Value("sent_ns", "when the message was sent", "integer", unit="ns"),
     )
 
 

@@ -94,6 +94,7 @@ class Loop:
         self._reported_ns = 0  # monotonic time of the last report
         self._reported: Continuation | None = None  # the continuation state reported last
         self._ended = False
+        self._offset_ns = Message.offset_ns  # that of the latest recording
 
     def run(self) -> None:
         """Run until the session ends."""
@@ -117,11 +118,19 @@ class Loop:
 
     def publish(self, message: Message) -> None:
         """Send a message to all subscribers, and count it and its latency if it is an answer of the model."""
-        self.publishers.publish(message, lambda sent: self.engine.published(sent, time.monotonic_ns()))
+        if self.engine.offset_ns is not None:
+            self._offset_ns = self.engine.offset_ns
+        self.publishers.publish(message, self._stamp)
         self.cause = message.cause
         if message.answers:
             self.forecasts += 1
             self.latencies.add(message.latency_ms)
+
+    def _stamp(self, message: Message) -> None:
+        """Write the time of publishing and the latency into a message."""
+        now_ns = time.monotonic_ns()
+        message.stamp(now_ns, self._offset_ns)
+        self.engine.published(message, now_ns)
 
     def report(self) -> None:
         """Report the session's state to the recording process; skipped if that process does not read."""

@@ -93,7 +93,7 @@ class Publishers:
     def publish(self, message: Message, stamp: Callable[[Message], None]) -> None:
         """Send a message to all subscribers and record it in the session's own streams.
 
-        ``stamp`` writes the current latency into the message; it is called for both.
+        ``stamp`` writes the current time and latency into the message; it is called for both.
         """
         stamp(message)
         for subscriber in self._subscribed:

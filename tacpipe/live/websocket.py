@@ -1,4 +1,9 @@
-"""Serve messages as JSON over websockets. Subscribers can neither delay the session nor exhaust its memory."""
+"""Serve messages as JSON over websockets. Subscribers can neither delay the session nor exhaust its memory.
+
+Each subscriber states the maximum age of its messages, and only few messages are on their way to it: it asks for each
+message (``?pull=1``), or its pongs to the server's pings show that messages reached it. When it is ready, it gets the
+newest message, and the number of those that it missed. So no message waits in a buffer until it is old.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,16 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections.abc import Coroutine
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import parse_qs, parse_qsl, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.typing import Origin
 
@@ -27,12 +36,10 @@ from tacpipe.printable import excerpt
 HOST = "127.0.0.1"  # default host of the server
 TOKEN = "TACPIPE_LIVE_TOKEN"  # variable of the environment; subscribers must send its value unless it is empty
 CONNECTIONS = 32  # maximum number of open connections, subscribed or not
-QUEUED = 16  # messages queued per subscriber; a third of a second at 50 Hz
-QUEUED_BYTES = 1 << 20  # maximum size of the messages queued per subscriber
-SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
-BEHIND = 100  # number of successive dropped messages after which a subscriber is disconnected
-# bytes that a client may send: for its request, then per second
-RECEIVED_BYTES, RECEIVED_BYTES_S = 1 << 14, 1 << 10
+MAX_AGE_MS = 100.0  # maximum age of messages for a subscriber that states none
+UNDERWAY = 4  # maximum number of messages on their way to a subscriber
+# bytes that a client may send: for its handshake, then per second (1,000 requests or pongs), and in one message
+RECEIVED_BYTES, RECEIVED_BYTES_S, RECEIVED_MESSAGE_BYTES = 1 << 14, 1 << 16, 1 << 10
 # The page comes from one file, and connects to its own server only.
 PAGE_HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
@@ -49,8 +56,39 @@ SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
 
 
+@dataclass(frozen=True)
+class PublishedMessage:
+    """A message as JSON, without the fields that differ between subscribers and without its closing brace."""
+
+    text: str
+    offset_ns: int  # from the monotonic clock to that of its stamps
+    measured_ns: int  # when its newest sample was measured, or when it was published if it is about no moment
+
+    @classmethod
+    def from_message(cls, message: Message) -> PublishedMessage:
+        """Return a message that is published now."""
+        content = {name: value for name, value in message.to_dict().items() if name != "sent_ns"}
+        now_ns = time.monotonic_ns() + message.offset_ns
+        measured_ns = now_ns if message.sampled_ns is None else message.sampled_ns
+        return cls(to_json(content).decode()[:-1], message.offset_ns, measured_ns)
+
+
+@dataclass(eq=False)
+class Subscriber:
+    """What a connection has asked for and got."""
+
+    connection: ServerConnection
+    max_age_ns: float
+    is_pulling: bool  # whether it asks for each message
+    number: int  # number of the last message that it got, or of the last one before it subscribed
+    ready: int  # number of messages that it may get now
+    missed: int = 0
+    asked: tuple[int, int] | None = None  # its clock when it last asked, and the monotonic clock when that arrived
+    pong: asyncio.Task[None] | None = None  # waits for the answer to the latest ping
+
+
 class WebsocketPublisher:
-    """A server of websockets in one thread. It drops messages for a slow subscriber, and then the subscriber.
+    """A server of websockets in one thread. A slow subscriber gets fewer messages.
 
     `place` is ``HOST:PORT`` with an optional ``?origin=ORIGIN`` for each web page that may subscribe: browsers send where a
     page comes from, and other pages are refused. Programs send no origin and are accepted.
@@ -72,7 +110,9 @@ class WebsocketPublisher:
         self._about = to_json(about.to_dict()).decode()
         self._token = os.environ.get(TOKEN, "")
         self._connections: set[ServerConnection] = set()
-        self._subscribers: dict[ServerConnection, int] = {}  # number of successive messages that each subscriber missed
+        self._subscribers: set[Subscriber] = set()
+        self._newest: PublishedMessage | None = None
+        self._number = 0  # number of published messages
         listening = _listening_socket(target)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="websocket", daemon=True)
@@ -85,9 +125,9 @@ class WebsocketPublisher:
         return len(self._subscribers)
 
     def publish(self, message: Message) -> None:
-        """Send a message to each subscriber that keeps up."""
+        """Send a message to each subscriber that is ready for it."""
         if self._subscribers:
-            self._loop.call_soon_threadsafe(self._send, to_json(message.to_dict()).decode())
+            self._loop.call_soon_threadsafe(self._replace_newest, PublishedMessage.from_message(message))
 
     def close(self) -> None:
         """End the server and its connections."""
@@ -111,7 +151,7 @@ class WebsocketPublisher:
             compression=None,
             open_timeout=OPEN_S,
             close_timeout=END_S,
-            max_size=RECEIVED_BYTES_S,
+            max_size=RECEIVED_MESSAGE_BYTES,
             create_connection=cast(type[ServerConnection], functools.partial(BoundedConnection, self._connections)),
             logger=SILENT,
         )
@@ -138,6 +178,10 @@ class WebsocketPublisher:
         if self._token and not hmac.compare_digest(header.encode(errors="replace"), f"Bearer {self._token}".encode()):
             return connection.respond(401, f"Send the token of {TOKEN}.\n")
         if "Upgrade" in request.headers:
+            try:
+                parse_query(request.path)
+            except ValueError:
+                return connection.respond(400, "max_age_ms must be a number of milliseconds above 0.\n")
             return None
         response = connection.respond(200, page())
         del response.headers["Content-Type"]
@@ -146,30 +190,71 @@ class WebsocketPublisher:
         return response
 
     async def _subscribe(self, connection: ServerConnection) -> None:
-        """Send a client the description and then the published messages, until it disconnects."""
+        """Send a client the description and then the newest messages, until it disconnects."""
+        assert connection.request is not None  # the handshake is complete
+        max_age_ms, is_pulling = parse_query(connection.request.path)
+        ready = 0 if is_pulling else UNDERWAY
+        subscriber = Subscriber(connection, max_age_ms * 1e6, is_pulling, self._number, ready)
         broadcast([connection], self._about)
-        self._subscribers[connection] = 0
+        self._subscribers.add(subscriber)
         try:
-            await connection.wait_closed()
+            async for text in connection:
+                if is_pulling:
+                    subscriber.asked = int(text), time.monotonic_ns()
+                    self._continue(subscriber)
+        except ValueError:
+            await connection.close(CloseCode.INVALID_DATA, "A request is an integer: the time of your clock in ns.")
         finally:
-            del self._subscribers[connection]
+            self._subscribers.discard(subscriber)
 
-    def _send(self, text: str) -> None:
-        """Send a message to the subscribers that are not behind, in the server's thread.
+    def _replace_newest(self, message: PublishedMessage) -> None:
+        """Send a message to the subscribers that are ready, in the server's thread."""
+        self._newest, self._number = message, self._number + 1
+        for subscriber in self._subscribers:
+            self.dropped += subscriber.number < self._number - 1
+            self._send(subscriber)
 
-        Others miss it; a subscriber that missed `BEHIND` messages in a row is cut off.
-        """
-        backlog_bytes = min(QUEUED * len(text), QUEUED_BYTES)
-        ready = []
-        for connection, missed in self._subscribers.items():
-            late = connection.transport.get_write_buffer_size() > backlog_bytes
-            self._subscribers[connection] = missed + 1 if late else 0
-            self.dropped += late
-            if missed + late == BEHIND:
-                connection.transport.abort()
-            elif not late:
-                ready.append(connection)
-        broadcast(ready, text)
+    def _continue(self, subscriber: Subscriber) -> None:
+        """Count that a subscriber is ready for another message, and send it if there is one."""
+        subscriber.ready = min(subscriber.ready + 1, UNDERWAY)
+        self._send(subscriber)
+
+    def _send(self, subscriber: Subscriber) -> None:
+        """Send the newest message to a subscriber that is ready and has not got it, unless it is too old."""
+        message = self._newest
+        if message is None or subscriber.number == self._number or not subscriber.ready:
+            return
+        now_ns = time.monotonic_ns() + message.offset_ns
+        if now_ns - message.measured_ns > subscriber.max_age_ns:
+            return
+        subscriber.missed += self._number - subscriber.number - 1
+        subscriber.number = self._number
+        subscriber.ready -= 1
+        fields = {"sent_ns": now_ns, "missed": subscriber.missed}
+        if subscriber.asked is not None:
+            asked_ns, heard_ns = subscriber.asked
+            fields |= {"asked_ns": asked_ns, "heard_ns": heard_ns + message.offset_ns}
+        broadcast([subscriber.connection], f"{message.text},{to_json(fields).decode()[1:]}")
+        if not subscriber.is_pulling:
+            subscriber.pong = self._loop.create_task(self._await_pong(subscriber))
+
+    async def _await_pong(self, subscriber: Subscriber) -> None:
+        """Wait until the messages so far have reached a subscriber."""
+        with contextlib.suppress(ConnectionClosed):
+            await (await subscriber.connection.ping())
+            self._continue(subscriber)
+
+
+def parse_query(path: str) -> tuple[float, bool]:
+    """Return the maximum age in ms, and whether the client asks for each message, from the path of its request.
+
+    Raises `ValueError` for an age that is not above 0.
+    """
+    options = dict(parse_qsl(urlsplit(path).query))
+    max_age_ms = float(options.get("max_age_ms", MAX_AGE_MS))
+    if not max_age_ms > 0:
+        raise ValueError
+    return max_age_ms, options.get("pull") == "1"
 
 
 def page() -> str:
@@ -192,9 +277,6 @@ def _listening_socket(target: str) -> socket.socket:
         listening = socket.create_server(address, family=family)
     except OSError as error:
         raise DeviceError(f"--publish ws:{target}: {error.strerror or error}. Take another port.") from error
-    listening.setsockopt(
-        socket.SOL_SOCKET, socket.SO_SNDBUF, SENDING_BYTES
-    )  # connections inherit the size of this buffer
     return listening
 
 

@@ -33,17 +33,23 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
+def visit(chromium: Browser, about: SlipDescription | ForecastDescription, max_age_ms: int) -> WebsocketPublisher:
+    """Return a publisher whose page a browser shows, with the maximum age of its messages."""
+    port = free_port()
+    publisher = WebsocketPublisher(f"127.0.0.1:{port}", about)
+    chromium.visit(f"http://127.0.0.1:{port}/?max_age_ms={max_age_ms}")
+    awaited(lambda: publisher.subscribers == 1)
+    return publisher
+
+
 def show(
     chromium: Browser, about: SlipDescription | ForecastDescription, messages: list[Message]
 ) -> WebsocketPublisher:
-    """Return a publisher whose page a browser shows, once it has drawn the messages."""
-    port = free_port()
-    publisher = WebsocketPublisher(f"127.0.0.1:{port}", about)
-    chromium.visit(f"http://127.0.0.1:{port}/")
-    awaited(lambda: publisher.subscribers == 1)
-    for message in messages:
+    """Return a publisher whose page a browser shows, once it has drawn the messages, which it keeps for minutes."""
+    publisher = visit(chromium, about, 600_000)
+    for number, message in enumerate(messages, start=1):
         publisher.publish(message)
-    awaited(lambda: chromium.run("messages") == len(messages))
+        awaited(lambda number=number: chromium.run("messages") == number)  # type: ignore[misc]
     chromium.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
     return publisher
 
@@ -80,6 +86,27 @@ def test_the_page_draws_the_skins_and_the_forecast_of_a_session_of_forecasts(chr
     assert chromium.run("ahead.map((row) => row[1])") == [2.5, 5.0]
     assert chromium.run("about.touch") == {"left": [5.0, 0.0]}
     assert chromium.run(PAINTED.format("history", 900, 220)) > 1000
+    left(chromium, publisher)
+
+
+def test_the_page_shows_no_alarm_that_is_no_longer_known_to_be_true(chromium: Browser) -> None:
+    publisher = visit(chromium, SLIPS, 500)
+    publisher.publish(SlipMessage(1, 20_000_000, 0.9, 0.0, ON))
+    awaited(lambda: chromium.run("messages") == 1)
+    awaited(lambda: chromium.run("document.getElementById('state').textContent") == "no message for 500 ms")
+    assert chromium.run("document.body.classList.contains('alarm')") is False
+    assert chromium.run("document.getElementById('answer').textContent") == "–"
+    left(chromium, publisher)
+
+
+def test_the_page_does_not_show_a_message_that_arrives_too_old(chromium: Browser) -> None:
+    publisher = show(chromium, SLIPS, [])
+    heard_ms, asked_ms = 5_000_000, 10.0
+    for measured_ms, is_shown in ((heard_ms - 700_000, False), (heard_ms, True)):
+        stamps = f"heard_ns: {heard_ms}e6, sampled_ns: {measured_ms}e6, asked_ns: {asked_ms}e6"
+        chromium.run(f"(receive({{kind: 'slip', probability: 0.5, alarm: 'on', {stamps}}}), true)")
+        assert chromium.run("document.body.classList.contains('alarm')") is is_shown
+    assert chromium.run("tooOld") == 1 and chromium.run("messages") == 1
     left(chromium, publisher)
 
 

@@ -123,6 +123,11 @@ class MaterialMessage(messages.Message):
         return self.probabilities is not None
 
     @property
+    def sampled_ns(self) -> int | None:
+        """When the newest sample was measured; None for a slide that has ended, whose answer stays valid."""
+        return None if self.ended else super().sampled_ns
+
+    @property
     def states(self) -> Mapping[str, str]:
         """The material and its probability, for display."""
         if self.probabilities is None:

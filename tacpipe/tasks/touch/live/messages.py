@@ -112,6 +112,11 @@ class TouchMessage(messages.Message):
         return self.touch is not None
 
     @property
+    def sampled_ns(self) -> None:
+        """None, because the cloud of a request has no time."""
+        return
+
+    @property
     def states(self) -> Mapping[str, str]:
         """The best grasp of the request, for display."""
         best = f"grasp {self.ranks.index(1)} of {len(self.ranks)}" if self.ranks else "unknown"
