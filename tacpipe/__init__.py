@@ -1,8 +1,8 @@
 """The Python API of tacpipe, a data pipeline for robot touch.
 
 `open` returns a `Dataset`, whose items are `Recording` objects; `run` runs a stage, as a command does; `load` loads a
-trained model; `stage` declares a new stage, which returns a table, a `RecordingOutput` or a `Result`. Errors are
-`TacpipeError` and its subclasses.
+trained model; `subscribe` receives the messages of a live session; `stage` declares a new stage, which returns a table, a
+`RecordingOutput` or a `Result`. Errors are `TacpipeError` and its subclasses.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.live.subscription import Subscription
 
     __version__: str
 
@@ -47,6 +48,7 @@ __all__ = [
     "ShortageError",
     "Stage",
     "StorageError",
+    "Subscription",
     "TacpipeError",
     "UsageError",
     "WouldChangeError",
@@ -55,6 +57,7 @@ __all__ = [
     "open",
     "run",
     "stage",
+    "subscribe",
 ]
 
 
@@ -67,6 +70,10 @@ def __getattr__(name: str) -> Any:
         from tacpipe.datasets import dataset
 
         return getattr(dataset, name)
+    if name == "Subscription":
+        from tacpipe.live.subscription import Subscription
+
+        return Subscription
     if name == "__version__":
         from importlib.metadata import version
 
@@ -194,3 +201,24 @@ def load(path: str | PathLike[str]) -> Any:
         from tacpipe.tasks.recordings import OpenedChain
 
         return task_of_model(model.files, str(path)).load(model.files, OpenedChain(model))
+
+
+def subscribe(address: str, max_age_ms: float = 100.0) -> Subscription:
+    """Receive the messages of the live session at ``address``, each at most ``max_age_ms`` old, or unknown.
+
+        with tacpipe.subscribe("ws://127.0.0.1:8765", max_age_ms=100) as messages:
+            for message in messages:
+                alarm = message.get("alarm", "unknown")
+
+    The age counts from the measurement of the newest sample. Each step returns the newest message, and never waits longer
+    than ``max_age_ms``: without a message, or a session, it returns ``{"kind": "unknown", "cause": ...}``.
+
+    :param address: ``ws://HOST:PORT``, as in ``tacpipe live --publish ws:HOST:PORT``; with ``/?token=TOKEN`` if the session
+        has a token.
+    :param max_age_ms: maximum age and waiting time in ms, at least two periods of the session.
+    :raises UsageError: for another address, or an age that is not above 0.
+    :raises MissingModuleError: without the extra ``live``.
+    """
+    from tacpipe.live.subscription import Subscription
+
+    return Subscription(address, max_age_ms)
