@@ -195,8 +195,8 @@ class WebsocketPublisher:
         max_age_ms, is_pulling = parse_query(connection.request.path)
         ready = 0 if is_pulling else UNDERWAY
         subscriber = Subscriber(connection, max_age_ms * 1e6, is_pulling, self._number, ready)
+        self._subscribers.add(subscriber)  # before its first message, after which it expects those that follow
         broadcast([connection], self._about)
-        self._subscribers.add(subscriber)
         try:
             async for text in connection:
                 if is_pulling:
