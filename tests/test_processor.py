@@ -50,6 +50,13 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
     assert ran.stdout.split() == [str(threads)] * 2
 
 
+@pytest.mark.parametrize("variables", [{}, {"OMP_WAIT_POLICY": "ACTIVE"}])
+def test_threads_that_wait_sleep_unless_the_environment_states_otherwise(variables: dict[str, str]) -> None:
+    program = "import os, sys, tacpipe.engine.pipeline; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    ran = run_python(Path(), "-c", program, environment=variables, check=True)
+    assert ran.stdout.split() == [variables.get("OMP_WAIT_POLICY", "PASSIVE"), "False"]
+
+
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
     stored = provenance.describe_provenance(1.0)
     assert provenance.environment_differences(stored, provenance.describe_provenance(2.0)) == []

@@ -30,6 +30,9 @@ _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "am
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
 JOBS = "TACPIPE_JOBS"  # number of processes of a command without --jobs, or with 0
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Waiting threads of OpenMP sleep. By default they spin for 3 ms: on a core that another program uses, they spin instead of
+# the thread for which they wait. OpenMP reads the variable when torch is imported, which happens after this module.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def describe_processor() -> Processor:
