@@ -42,7 +42,7 @@ BUSY = "while True: pass"
 
 def run(command: str, folder: Path, variables: Mapping[str, str]) -> tuple[float, float]:
     """Run a command; return its wall and CPU seconds."""
-    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES} | variables
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES} | dict(variables)
     before, began_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-m", "tacpipe", *command.split()], cwd=folder, env=environment, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -21,7 +21,7 @@ from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.recording.spool import Spool, StreamNote
 from tacpipe.recording.spool_folders import ClockReading
 from tacpipe.recording.station import LOST, Station, explain_silence
-from tacpipe.recording.watch import Watch
+from tacpipe.recording.watch import SILENT_S, Watch
 from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Options
@@ -29,7 +29,6 @@ from tacpipe.sensors.sensor import Options
 TICK_S = 0.05  # period of moving bytes to the spool; a crash loses about this much
 SYNC_S = 0.5  # period of syncing the spool
 FIRST_S = 3.0  # timeout for the first sample of a stream that sends continuously
-SILENT_S = 2.0  # a stream that sends continuously counts as lost after this time without a sample
 DRAIN_S = 2.0  # timeout for emptying the links at the end of a recording
 DRAIN_PAUSE_S = 0.005  # pause between two looks whether they are empty
 PREROLL_S = 0.5  # recorded time before a trigger

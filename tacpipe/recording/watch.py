@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -16,13 +18,15 @@ from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.recording import clock
+from tacpipe.recording.pace import STALLED, parse_stall
 from tacpipe.recording.reading import Batch, LinkReader
 from tacpipe.recording.rig import RigStream
 from tacpipe.recording.spool import StreamNote
-from tacpipe.recording.station import LOST
+from tacpipe.recording.station import FOREIGN, LOST, OPENED, OVERRUN, REFUSED
 from tacpipe.sensors.framing import Chunks
 
 WINDOW_NS = 2_000_000_000  # window over which rate and jitter are measured
+SILENT_S = 2.0  # a stream that sends continuously counts as lost after this time without a sample
 REST_S = 0.5  # window over which the rest level of a tactile channel is averaged
 
 
@@ -50,6 +54,7 @@ class Watch:
         self.newest_packet: bytes | None = None  # the newest frame of a camera
         self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to identify the device if they contain no frame
         self.last_ns: int | None = None  # arrival of the newest sample
+        self.notes: deque[StreamNote] = deque(maxlen=64)  # notes that are not shown yet
         self._reader = LinkReader(stream.sensor)
         self._recent: deque[tuple[Int64s, Int64s | None]] = deque()
         self._rest_samples: list[Floats] = []
@@ -60,6 +65,8 @@ class Watch:
         for block in blocks:
             if isinstance(block, Chunks):
                 self.heard.append(block)
+            else:
+                self.notes.append(block)
             try:
                 if isinstance(block, Chunks):
                     self._add_batch(self._reader.feed(block))
@@ -129,6 +136,7 @@ def tactile_channels(stream: RigStream) -> list[tuple[int, Any]]:
 
 REFRESH_HZ = 8.0  # refresh rate on a terminal
 LINE_S = 5.0  # period of plain lines without a terminal
+STALL_LINES_NS = 5_000_000_000  # minimum time between two lines about delays, which each stream notes
 SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange1", "red")
 MAX_COLUMNS = 16  # maximum number of columns of the heat map
 
@@ -147,6 +155,9 @@ class RigView:
             name: [position for position, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
         }
         self._largest = dict.fromkeys(watches, 1.0)
+        self._lost: set[str] = set()  # streams whose link is lost
+        self._silent: set[str] = set()  # streams that are open and send nothing
+        self._stall_ns = -STALL_LINES_NS  # time of the last line about a delay of this program
 
     @contextlib.contextmanager
     def open(self) -> Iterator[RigView]:
@@ -162,8 +173,13 @@ class RigView:
         self._live = None
 
     def show(self, state: str) -> None:
-        """Show the figures of the streams, and ``state``, a description of the rig's activity."""
+        """Show the figures of the streams, ``state``, a description of the rig's activity, and a line for each new event."""
         now_s = clock.now_s()
+        for event in [] if self._quiet else self._new_events():
+            if self._live is not None:
+                self._live.console.print(printable.shown(event), markup=False, highlight=False, soft_wrap=True)
+            else:
+                terminal.note(event)
         if self._quiet or now_s - self._shown_s < (1 / REFRESH_HZ if self._live else LINE_S):
             return
         self._shown_s = now_s
@@ -175,6 +191,46 @@ class RigView:
             terminal.note(f"{state}: {summary}")
             for footer_line in self._footer():
                 terminal.note(footer_line)
+
+    def _new_events(self) -> list[str]:
+        """Return a line with the time of day for each event since the last call: a loss, a silence, dropped data."""
+        events = []
+        now_ns = clock.now_ns()
+        for name, watch in self._watches.items():
+            while watch.notes:
+                note = watch.notes.popleft()
+                events.append((note.t_ns, self._describe_note(name, note)))
+            last_ns = watch.last_ns
+            if not watch.stream.sensor.awaited or last_ns is None or name in self._lost:
+                continue
+            is_silent = now_ns - last_ns > SILENT_S * 1e9
+            if is_silent and name not in self._silent:
+                self._silent.add(name)
+                events.append((last_ns, f"Stream {name} sends nothing from now on, though its link is open."))
+            elif not is_silent and name in self._silent:
+                self._silent.remove(name)
+                events.append((last_ns, f"Stream {name} sends again."))
+        offset_ns = time.time_ns() - now_ns
+        times = ((datetime.fromtimestamp((t_ns + offset_ns) / 1e9), text) for t_ns, text in events if text)
+        return [f"{moment:%H:%M:%S} {text}" for moment, text in times]
+
+    def _describe_note(self, name: str, note: StreamNote) -> str:
+        """Return a note as a sentence, or nothing for one that users need not know."""
+        if note.what == LOST:
+            self._lost.add(name)
+            return note.detail  # a sentence that names the stream
+        if note.what == OPENED and name in self._lost:
+            self._lost.remove(name)
+            return f"Stream {name} is open again."
+        if note.what == OVERRUN:
+            return f"Stream {name}: {note.detail} overruns of its link, whose data are lost."
+        if note.what in (FOREIGN, REFUSED):
+            return f"Stream {name}: {note.detail}."
+        stall = parse_stall(note.detail) if note.what == STALLED else None
+        if stall is None or note.t_ns - self._stall_ns < STALL_LINES_NS:
+            return ""
+        self._stall_ns = note.t_ns
+        return f"This program was delayed by {stall.duration_ns / 1e6:.0f} ms, so arrival times are late."
 
     def _render(self, state: str, figures: Mapping[str, Figures]) -> Any:
         """Return a table of the figures, the footer and the heat maps for the terminal."""

@@ -20,6 +20,7 @@ TIMES = 50
 HANGS_S = 600.0
 LIMITS = {
     "tacpipe.recording.recorder": ("FIRST_S", "SILENT_S"),
+    "tacpipe.recording.watch": ("SILENT_S",),
     "tacpipe.recording.station": ("MUTE_S", "TARE_S", "REPLY_S", "STOP_S"),
     "tacpipe.recording.pace": ("STALL_NS",),
     "tacpipe.links.network": ("CONNECT_S",),

@@ -110,7 +110,9 @@ def test_a_device_that_is_away_at_the_end_is_an_error_and_the_rest_is_kept(lab: 
     at = rig.rig.streams[name].address
 
     assert process.returncode == 5
-    first, second, third = without_created_store(err).splitlines()
+    lines = without_created_store(err).splitlines()
+    *events, first, second, third = lines
+    assert len([line for line in events if f"Stream {name} ({at}) is lost" in line]) == 1
     assert first.startswith("one: ") and "force" in first
     assert second == "tacpipe: What came is recorded and kept, but streams were lost on the way."
     assert third.startswith(f"Stream {name} ({at}): there is no port ")

@@ -14,8 +14,11 @@ from tacpipe.errors import UsageError
 from tacpipe.links.link import Address, parse
 from tacpipe.recording import clock, rig
 from tacpipe.recording import watch as view_of
+from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stall
 from tacpipe.recording.pictures import serve_pictures
 from tacpipe.recording.rig import RigStream, build_sensor
+from tacpipe.recording.spool import StreamNote
+from tacpipe.recording.station import LOST, OPENED, OVERRUN, REFUSED
 from tacpipe.recording.watch import RigView, Watch
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
@@ -69,6 +72,45 @@ def test_lines_tell_rates_and_losses(
     rate_hz = 392 / 0.399
     expected = f"force {rate_hz:.1f} Hz, jitter {jitter_ms:.1f} ms, 393 samples, 7 lost"
     assert capsys.readouterr().err == f"recording one, 3 s: {expected}\n"
+
+
+def test_each_event_of_a_stream_is_one_line_with_its_time_and_none_if_asked(
+    force: Watch, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = [0.4]
+    monkeypatch.setattr(clock, "now_ns", lambda: round(now_s[0] * 1e9))
+    loud, quiet = RigView({"force": force}), RigView({"force": force}, quiet=True)
+
+    def lines(at_s: float, *blocks: Chunks | StreamNote) -> list[str]:
+        now_s[0] = at_s
+        force.feed(list(blocks))
+        quiet.show("recording one")
+        loud.show("recording one")
+        printed = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("recording one")]
+        assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in printed)
+        return [line[9:] for line in printed]
+
+    def note(at_s: float, what: str, detail: str = "") -> StreamNote:
+        return StreamNote(round(at_s * 1e9), "force", what, detail)
+
+    def samples(at_s: float) -> Chunks:
+        start_ns = round(at_s * 1e9)
+        return Chunks.from_pairs([(start_ns + row * 1_000_000, frame) for row, frame in enumerate(frames(10))])
+
+    assert lines(0.5, note(0.1, OPENED)) == []  # the beginning is no event
+    assert lines(1.0, note(0.9, LOST, "Stream force is lost: unplugged.")) == ["Stream force is lost: unplugged."]
+    assert lines(4.0) == []  # nothing comes from a lost stream
+    assert lines(4.5, note(4.4, OPENED), samples(4.4)) == ["Stream force is open again."]
+    assert lines(6.0) == []
+    assert lines(7.0) == ["Stream force sends nothing from now on, though its link is open."]
+    assert lines(8.0) == []
+    assert lines(9.0, samples(8.9)) == ["Stream force sends again."]
+    stall = note(9.05, STALLED, Stall(250_000_000, 0).detail)
+    assert lines(9.1, stall, note(9.1, STALLED, Stall(1, 1).detail), note(9.1, CAUGHT_UP)) == [
+        "This program was delayed by 250 ms, so arrival times are late."
+    ]
+    assert lines(9.2, note(9.2, OVERRUN, "3")) == ["Stream force: 3 overruns of its link, whose data are lost."]
+    assert lines(9.3, note(9.3, REFUSED, "7 packets were left out")) == ["Stream force: 7 packets were left out."]
 
 
 def test_lines_come_now_and_then_and_not_at_all_if_asked(
