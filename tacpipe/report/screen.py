@@ -46,7 +46,7 @@ def sentence(context: Context) -> tuple[str, str]:
         return "", ""
     text = "; ".join(clauses[:2])
     verdict = verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
-    return f"{text[:1].upper()}{text[1:]}.", verdict
+    return f"{_capital(text)}.", verdict
 
 
 def first_chart(context: Context) -> Chart | None:
@@ -166,9 +166,7 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
             ]
         rows.append(cells)
     measure = next(iter(parts.values()))[0].measure
-    return table_of(
-        f"{measure.columns[0][:1].upper()}{measure.columns[0][1:]} by target, next to the best baseline", heads, rows
-    )
+    return table_of(f"{_capital(measure.columns[0])} by target, next to the best baseline", heads, rows)
 
 
 def gain_cell(measure: Measure, gain: Gain) -> Cell:

@@ -25,7 +25,7 @@ from tacpipe.training.following import Line, Validated
 KERNEL = 3
 HELD_OUT = 5  # every fifth group stops the training early
 LIMIT = 10.0  # maximum scaled value
-MAX_WIDTH = 4096  # maximum number of channels of a stored network
+MAX_WIDTH, MAX_LAYERS = 4096, 8  # maximum number of channels and layers of a stored network
 
 
 class CausalNetwork(nn.Module):
@@ -162,7 +162,8 @@ class FittedNetwork:
         """Return the stored network. Raises `ValueError` or `RuntimeError` if its parts do not fit one another."""
         sizes = {name: int(described[name]) for name in ("inputs", "channels", "layers", "outputs")}
         widths = (sizes["inputs"], sizes["channels"])
-        if sizes["outputs"] != outputs or not all(0 < width <= MAX_WIDTH for width in widths) or sizes["layers"] > 8:
+        is_sized = all(0 < width <= MAX_WIDTH for width in widths) and 0 < sizes["layers"] <= MAX_LAYERS
+        if sizes["outputs"] != outputs or not is_sized:
             raise ValueError(f"a network of {sizes} for {outputs} outputs")
         network = CausalNetwork(**sizes)
         weights = {name.removeprefix("network."): torch.from_numpy(np.array(value)) for name, value in arrays.items()}

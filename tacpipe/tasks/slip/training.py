@@ -40,7 +40,7 @@ from tacpipe.tasks.slip.windows import (
 )
 
 TASK = "slip"
-CONSTANT, BEST_FEATURE = "constant", "best_feature"  # names of baselines
+BEST_FEATURE = "best_feature"  # name of a baseline
 
 
 def train(
@@ -57,15 +57,13 @@ def train(
     examples = read_examples(reader, tracks, params, params.stride)
     _require_both(examples, params, len(training.recordings), len(tracks))
     held_out = labelled_tracks(reader, validation) if validation is not None else []
-    outputs = np.stack([~are_slips(examples), are_slips(examples)], axis=1).astype(np.float64)
-    baselines = baseline_fits(reader, examples)
+    slips = are_slips(examples)
+    outputs = np.stack([~slips, slips], axis=1).astype(np.float64)
+    baselines = baseline_fits(reader)
     candidates = {name: _of_counted(fit) for name, fit in params.candidates(workspace).items()}
     chosen = selection.select(baselines, candidates, outputs, examples, area_losses, params.seed)
-    estimators = {
-        name: fit(examples, outputs, "all")
-        for name, fit in {**baselines, **candidates}.items()
-        if name in baselines or name == chosen.name
-    }
+    fits = {**baselines, chosen.name: {**candidates, **baselines}[chosen.name]}
+    estimators = {name: fit(examples, outputs, "all") for name, fit in fits.items()}
     calibrations = {
         name: calibrate_scores(estimator, scores_of(chosen.predicted[name]), examples, held_out, params)
         for name, estimator in estimators.items()
@@ -130,11 +128,11 @@ def area_losses(outputs: Floats, examples: Examples, folds: Indices) -> Floats:
     return np.array([1 - float(np.mean(found)) for found in by_fold if found] or [1.0])
 
 
-def baseline_fits(reader: FingerReader, examples: Examples) -> dict[str, Fit]:
+def baseline_fits(reader: FingerReader) -> dict[str, Fit]:
     """Return the baselines in the order of simplicity: a constant, the time, the best single feature, and the plan."""
     planned = [reader.names.index(name) for name in NAMES_OF_PLAN] if reader.reads_plans else []
     fits: dict[str, Fit] = {
-        CONSTANT: lambda part, outputs, name: FittedConstant.fit(part, outputs, "class"),
+        "constant": lambda part, outputs, name: FittedConstant.fit(part, outputs, "class"),
         "time_only": lambda part, outputs, name: _small_trees(part, outputs, "class", features="time"),
         BEST_FEATURE: lambda part, outputs, name: fit_columns(FittedLinear.fit, part, outputs, [best_column(part)]),
     }
