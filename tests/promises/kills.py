@@ -33,7 +33,9 @@ from tests.promises.warm import Warm, serving
 
 PATIENCE_S = 60.0  # A process that should have ended counts as hanging after this time.
 # Notes, which are not errors: on recordings, what an export does not carry, and a new store.
-NOTE = re.compile(r"tacpipe: (?:(?:not carried|[\w-]+|all \d+ recordings): |created the store |a step is )")
+NOTE = re.compile(
+    r"tacpipe: (?:(?:not carried|[\w-]+|all \d+ recordings): |\d+ \.\w+ files? below |created the store |a step is )"
+)
 
 
 class Running(Protocol):
