@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 from tacpipe.io import Json
 from tacpipe.live import wire
@@ -19,13 +18,6 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
 SETTLE_NS = 2_000_000  # duration after a row's time in which its samples may still arrive from other threads
-
-
-class Continuation(Protocol):
-    """The state with which a new process continues a recording."""
-
-    def to_json(self) -> Json:
-        """Return the state as the JSON of the note `wire.CONTINUE`."""
 
 
 class Engine(ABC):
@@ -60,7 +52,7 @@ class Engine(ABC):
         return {}
 
     @property
-    def beginning(self) -> Continuation | None:
+    def beginning(self) -> Json | None:
         """The state with which another process can continue the recording, or None if there is none yet."""
         return None
 

@@ -19,8 +19,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tacpipe.errors import FAILED, TacpipeError, UsageError
+from tacpipe.io import Json
 from tacpipe.live import publishing, wire
-from tacpipe.live.engine import Continuation, Engine
+from tacpipe.live.engine import Engine
 from tacpipe.live.messages import Message
 from tacpipe.live.preparation import open_model
 from tacpipe.live.publishing import Publishers
@@ -92,7 +93,7 @@ class Loop:
         self.forecasts = 0
         self.cause = ""  # the reason why the latest message has no prediction
         self._reported_ns = 0  # monotonic time of the last report
-        self._reported: Continuation | None = None  # the continuation state reported last
+        self._reported: Json | None = None  # the continuation state reported last
         self._ended = False
         self._offset_ns = Message.offset_ns  # that of the latest recording
 
@@ -152,7 +153,7 @@ class Loop:
         send_line(self.connection, {"report": figures})
         beginning = self.engine.beginning if self.engine.running else None
         if beginning is not None and beginning != self._reported:
-            send_line(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
+            send_line(self.connection, {"beginning": beginning, "offset_ns": self.engine.offset_ns})
         self._reported = beginning
 
     def _fetch(self) -> None:

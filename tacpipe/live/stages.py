@@ -16,11 +16,14 @@ from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute, RecordingOutput
+from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.synchronization.placement import are_arrivals, equal_fraction
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
 from tacpipe.video.stream import read_format
 
+MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
+DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 PIECE_NS = 1_000_000_000  # duration of the pieces in which a recording is replayed
 CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.difference": lambda params, place: DifferenceChannels(
@@ -87,6 +90,26 @@ def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
             "original recordings; the model's own stages run on them."
         )
     return {name: recording.table(name) for name in recording.streams}
+
+
+def require_sessions(digest: str, recordings: Dataset, stream: str) -> None:
+    """Raise `UsageError` unless all recordings are of sessions that published ``stream`` with the model of this digest.
+
+    The messages of another model describe nothing of this model and differ from its predictions in every row.
+    """
+    for name, recording in sorted(recordings.recordings.items()):
+        if stream not in recording.streams or LATENCY not in recording.streams:
+            raise UsageError(
+                f"{name} is not a recording of a live session with this model: it has no stream {stream}. Give what "
+                f"`tacpipe live -o` recorded, or leave --live out."
+            )
+        ran = recording.attributes.get(MODEL, digest)  # missing in recordings of other programs
+        if ran != digest:
+            raise UsageError(
+                f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}. Its published "
+                f"values are of that model. Give the model that the session ran, or leave --live out to evaluate this one "
+                f"on the same recordings."
+            )
 
 
 def arrival_streams(recording: Recording, tables: Mapping[str, pa.Table]) -> list[str]:

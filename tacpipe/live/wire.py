@@ -112,7 +112,7 @@ class ModelLine(TypedDict, total=False):
     refused: str
     exit_code: int
     report: SessionFigures
-    beginning: Json  # see `tacpipe.live.engine.Continuation`
+    beginning: Json  # state of `tacpipe.live.engine.Engine.beginning`
     offset_ns: int | None
 
 

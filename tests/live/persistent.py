@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import UsageError
+from tacpipe.io import Json
 from tacpipe.live import preparation, process, session
+from tacpipe.live.decoding import likely_schema
 from tacpipe.live.preparation import LiveModel
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs
-from tacpipe.tasks.forward.live.chain import Beginning, Cause, GridForecast
+from tacpipe.tasks.forward.live.chain import Cause, GridForecast
 from tacpipe.tasks.forward.live.engine import ForecastEngine
 from tacpipe.tasks.forward.live.task import ForwardSettings
 
@@ -44,7 +46,7 @@ class Persistence:
     unit = "count"
 
     def __init__(
-        self, layouts: Mapping[str, Any], beginning: Beginning | None = None, quantiles: Sequence[int] = ()
+        self, layouts: Mapping[str, Any], beginning: Json | None = None, quantiles: Sequence[int] = ()
     ) -> None:
         if "skin" not in layouts:
             raise UsageError(f"The model reads the stream skin, and the rig has {', '.join(layouts)}.")
@@ -67,12 +69,13 @@ class Persistence:
         self.late["skin"] += int((t_ns <= self._passed_ns).sum())
         self._samples += list(zip(t_ns.tolist(), values.astype(np.float32), strict=True))
         if self._next_ns is None and len(t_ns):
-            self.beginning = self.beginning or Beginning(int(t_ns[0]), ())
-            since_ns = int(t_ns[0]) - self.beginning.origin_ns
-            self._next_ns = self.beginning.origin_ns + -(-since_ns // PERIOD_NS) * PERIOD_NS
+            self.beginning = self.beginning or {"origin_ns": int(t_ns[0]), "rest": []}
+            origin_ns = self.beginning["origin_ns"]
+            since_ns = int(t_ns[0]) - origin_ns
+            self._next_ns = origin_ns + -(-since_ns // PERIOD_NS) * PERIOD_NS
 
-    def continue_cameras(self, previous: Any) -> None:
-        """It has no cameras."""
+    def take_over(self, previous: Any) -> None:
+        """It has neither plans nor cameras."""
 
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return a forecast for each grid point, on request for the newest alone."""
@@ -124,7 +127,8 @@ def engine(options: SessionOptions) -> ForecastEngine:
     assert isinstance(forward_settings, ForwardSettings)
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(Persistence, quantiles=forward_settings.quantiles)
+    layouts = {name: likely_schema(sensor) for name, sensor in sensors.items()}
+    opened: Any = functools.partial(Persistence, layouts, quantiles=forward_settings.quantiles)
     forecast_engine = ForecastEngine(
         sensors, opened, forward_settings.steps or None, quantiles=forward_settings.quantiles
     )

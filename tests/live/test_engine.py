@@ -2,11 +2,14 @@
 
 import functools
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tacpipe.live import wire
+from tacpipe.live.decoding import likely_schema
+from tacpipe.live.rows import EARLY_NS
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool import StreamNote
 from tacpipe.recording.station import BEGAN, LOST
@@ -14,7 +17,7 @@ from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward.live.chain import Cause
-from tacpipe.tasks.forward.live.engine import EARLY_NS, ForecastEngine
+from tacpipe.tasks.forward.live.engine import ForecastEngine
 from tacpipe.tasks.forward.live.messages import ForecastMessage
 from tests.live.persistent import CHANNELS, HORIZON, PERIOD_NS, Persistence
 from tests.sensors import made
@@ -29,7 +32,8 @@ class Session:
 
     def __init__(self, count: int = 200) -> None:
         self.sensor: Sensor = rigs.build_sensor("xela", {"rate_hz": 50}, "skin")
-        self.engine = ForecastEngine({"skin": self.sensor}, Persistence, settle_ns=SETTLE_NS)
+        opened: Any = functools.partial(Persistence, {"skin": likely_schema(self.sensor)})
+        self.engine = ForecastEngine({"skin": self.sensor}, opened, settle_ns=SETTLE_NS)
         self.engine.resting_ns = 0
         samples = made.samples("xela", self.sensor, count, 1)
         self.values = np.hstack(samples.values).astype(np.float32)
@@ -48,7 +52,8 @@ class Session:
 
     def at(self, periods: float) -> list[ForecastMessage]:
         """Return what is published so long after the start, once what belongs to it has settled."""
-        return self.engine.step(START_NS + round(periods * PERIOD_NS) + SETTLE_NS)
+        messages: Any = self.engine.step(START_NS + round(periods * PERIOD_NS) + SETTLE_NS)
+        return list(messages)
 
 
 @pytest.fixture
@@ -87,7 +92,7 @@ def test_a_session_that_fell_behind_publishes_the_newest_row_and_counts_the_othe
 
 def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> None:
     session = Session()
-    opened = functools.partial(Persistence, quantiles=(10, 90))
+    opened: Any = functools.partial(Persistence, {"skin": likely_schema(session.sensor)}, quantiles=(10, 90))
     engine = ForecastEngine({"skin": session.sensor}, opened, (1, 3), quantiles=(10, 90))
     session.engine, engine.resting_ns = engine, 0
     session.begin()
@@ -162,9 +167,9 @@ def test_a_link_that_is_lost_and_back_goes_on_without_a_new_session(session: Ses
 def test_after_blocks_were_thrown_away_a_new_chain_begins_and_the_cause_is_reported(session: Session) -> None:
     session.send(0, 5)
     session.at(4)
-    before = session.engine.chain
+    before = session.engine.rows
     session.engine.take("", StreamNote(START_NS, "", wire.OVERFLOW))
-    assert session.engine.chain is not before and session.engine.overflows == 1
+    assert session.engine.rows is not before and session.engine.overflows == 1
     messages = [message for periods in range(5, 10) for message in session.at(periods)]
     assert messages and "overload" in messages[0].cause and messages[0].values is None
     session.send(10, 11)
@@ -209,16 +214,16 @@ def test_after_the_recording_nothing_is_predicted_until_the_next_one_begins(sess
 def test_after_blocks_were_thrown_away_and_after_a_process_that_ended_the_grid_is_continued(session: Session) -> None:
     session.send(0, 5)
     session.at(4)
-    beginning = session.engine.chain.beginning
-    assert beginning is not None and beginning.origin_ns == START_NS + OFFSET_NS
+    beginning = session.engine.rows.beginning
+    assert beginning is not None and beginning["origin_ns"] == START_NS + OFFSET_NS
     session.engine.take("", StreamNote(START_NS, "", wire.OVERFLOW))
-    assert session.engine.chain.beginning == beginning
+    assert session.engine.rows.beginning == beginning
     restarted = Session()
-    restarted.engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
+    restarted.engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(beginning)))
     restarted.begin()
     late = START_NS + 7 * PERIOD_NS + PERIOD_NS // 3
     restarted.engine.take("skin", Chunks.from_pairs([(late, restarted.packets[7])]))
     (message,) = restarted.at(8)
     assert message.t_ns == START_NS + OFFSET_NS + 8 * PERIOD_NS and message.values is not None
     restarted.begin()  # another recording has a grid of its own
-    assert restarted.engine.chain.beginning is None
+    assert restarted.engine.rows.beginning is None

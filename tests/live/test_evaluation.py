@@ -12,6 +12,7 @@ import tacpipe
 from tacpipe.errors import UsageError
 from tacpipe.live import messages
 from tacpipe.live.preparation import open_model
+from tacpipe.live.stages import MODEL, require_sessions
 from tacpipe.tasks.forward.live import evaluation
 from tacpipe.tasks.forward.live import measures as truth
 from tacpipe.tasks.forward.live import measures as worth
@@ -69,18 +70,18 @@ class Session:
     streams = ("forecast", "latency")
 
     def __init__(self, digest: str | None) -> None:
-        self.attributes = {} if digest is None else {evaluation.MODEL: digest}
+        self.attributes = {} if digest is None else {MODEL: digest}
 
 
 def test_a_session_of_another_model_is_refused_with_both_digests() -> None:
     own_digest, other_digest = "ab" * 32, "cd" * 32
     recordings: Any = type("Given", (), {"recordings": {"one": Session(own_digest), "two": Session(other_digest)}})()
     with pytest.raises(UsageError) as raised:
-        evaluation.check(own_digest, recordings)
+        require_sessions(own_digest, recordings, "forecast")
     assert "session of two ran the model cdcdcdcdcdcd, and this one is abababababab" in str(raised.value)
     assert "leave --live out" in str(raised.value)
     recordings.recordings = {"one": Session(own_digest), "stated by nobody": Session(None)}
-    evaluation.check(own_digest, recordings)
+    require_sessions(own_digest, recordings, "forecast")
 
 
 @pytest.mark.long
@@ -91,7 +92,7 @@ def test_the_model_of_the_session_is_known_by_the_digest_that_tacpipe_live_recor
     digest, other_digest = (open_model(model).dataset.digest for model in ("models/f", "models/g"))
     recordings: Any = type("Given", (), {"recordings": {"one": Session(digest)}})()
     assert digest != other_digest
-    evaluation.check(tacpipe.open("models/f").digest, recordings)
+    require_sessions(tacpipe.open("models/f").digest, recordings, "forecast")
     with pytest.raises(UsageError, match="ran the model"):
         evaluation.evaluate(tacpipe.open("models/g"), recordings)
 

@@ -1,5 +1,6 @@
 """Test that live materials are those of the samples so far, and finally those of `tacpipe predict`."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import wire
 from tacpipe.live.messages import packets
+from tacpipe.live.rows import OVERLOADED, RESTARTED
 from tacpipe.live.settings import Settings
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
@@ -26,7 +28,7 @@ from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import network_training, sensor_calibration
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.live import slide as material_replay
-from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
+from tacpipe.tasks.material.live.engine import MaterialEngine
 from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.tasks.material.live.slide import UNLIKE
 from tacpipe.tasks.material.live.task import MaterialLive, MaterialSettings
@@ -63,16 +65,15 @@ class Opened:
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
+    return {kind: Opened(train(kind, tmp_path_factory.mktemp(kind))) for kind in KINDS}
+
+
+def train(kind: str, folder: Path) -> Any:
+    """Return the files of a model of the simulated slides."""
     parts = [
         slides(RIG, indices(RIG, ["biotac"], chosen_trials), frames=FRAMES) for chosen_trials in (TRAINED, [UNSEEN])
     ]
-    loaded = {}
-    for kind, params in KINDS.items():
-        train_params = fitting("train.material", params)
-        loaded[kind] = Opened(
-            network_training.train(train_params, parts[0], parts[1], tmp_path_factory.mktemp(kind), None)
-        )
-    return loaded
+    return network_training.train(fitting("train.material", KINDS[kind]), parts[0], parts[1], folder, None)
 
 
 def opened(model: Any, sensors: dict[str, Any], **changed: Any) -> MaterialEngine:
@@ -107,7 +108,7 @@ class Session:
 
     def run(self, until_ns: int, cut: int = 7) -> list[MaterialMessage]:
         """Have all arrive up to a time, some at once, and return what is published meanwhile."""
-        messages = []
+        messages: list[Any] = []
         while self.sent < len(self.t_ns) and self.t_ns[self.sent] <= until_ns:
             stop = min(self.sent + cut, int(np.searchsorted(self.t_ns, until_ns, side="right")))
             chunks = [(int(self.t_ns[row]), self.packets[row]) for row in range(self.sent, stop)]
@@ -120,7 +121,9 @@ class Session:
         """End the recording and return the last message."""
         self.engine.take("", StreamNote(0, "", wire.END))
         self.engine.take("finger", StreamNote(0, "finger", OVER))
-        return self.engine.step(int(self.t_ns[-1]) + 10**9)[-1]
+        last = self.engine.step(int(self.t_ns[-1]) + 10**9)[-1]
+        assert isinstance(last, MaterialMessage)
+        return last
 
 
 def predicted(model: Any, table: Any, **params: Any) -> Any:
@@ -219,6 +222,7 @@ def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_i
     half = int(session.t_ns[len(session.t_ns) // 2])
     assert session.run(half)[-1].probabilities is not None
     (silent,) = session.engine.step(half + EVERY_NS + SETTLE_NS)
+    assert isinstance(silent, MaterialMessage)
     assert silent.probabilities is None and silent.cause == "nothing new comes from finger"
     assert session.run(10**19)[-1].probabilities is not None
 
@@ -307,13 +311,13 @@ def test_a_pause_is_refused_where_only_an_arm_could_end_a_slide(models: dict[str
 
 def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dict[str, Opened]) -> None:
     session = Session(models["statistics"])
-    session.engine.take("", StreamNote(0, "", wire.CONTINUE, "{}"))
+    session.engine.take("", StreamNote(0, "", wire.CONTINUE, json.dumps({"slide": 2})))
     session.begin()
     messages = session.run(int(session.t_ns[300]))
     assert messages and {message.cause for message in messages} == {RESTARTED}
     session.begin()
     session.engine.take("", StreamNote(0, "", wire.OVERFLOW))
-    assert {message.cause for message in session.run(int(session.t_ns[400]))} == {THROWN}
+    assert {message.cause for message in session.run(int(session.t_ns[400]))} == {OVERLOADED}
     next_session = Session(models["statistics"])
     next_session.begin()
     assert next_session.run(10**19)[-1].cause == ""

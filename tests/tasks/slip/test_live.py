@@ -117,6 +117,7 @@ def planned_model(request: Any, rig: Rig, tmp_path_factory: pytest.TempPathFacto
 def engine_for(rig: Rig, model: SlipModel, level: float = 0.0) -> SlipEngine:
     sensors = {**rig.sensors, **({"plan": plan.Plan()} if model.reader.reads_plans else {})}
     engine = SlipEngine(model, sensors, SlipDescription("m", 50.0, 0.4, "1", {}), level, settle_ns=SETTLE_NS)
+    engine.resting_ns = 0
     engine.take("", StreamNote(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
     for name in sensors:
         engine.take(name, StreamNote(START_NS, name, BEGAN))
@@ -192,7 +193,7 @@ def test_a_message_says_why_there_is_no_probability(rig: Rig, model: SlipModel) 
     assert first.cause == "the window of left, right is being filled"
     assert not first.answers
     (silent,) = engine.step(rig.at_ns("right", 4) + 400_000_000)
-    assert silent.cause == "no sample comes from left"
+    assert silent.cause == "nothing comes from left, right"
 
 
 def test_a_session_that_fell_behind_publishes_the_newest_probabilities_and_counts_the_others(
@@ -210,7 +211,7 @@ def test_a_process_that_replaces_another_takes_its_levels_at_rest(rig: Rig, mode
     state = before.beginning
     assert state is not None
     engine = SlipEngine(model, rig.sensors, SlipDescription("m", 50.0, 0.4, "1", {}), 0.0, settle_ns=SETTLE_NS)
-    engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(state.to_json())))
+    engine.take("", StreamNote(START_NS, "", wire.CONTINUE, json.dumps(state)))
     engine.take("", StreamNote(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
     for name in STREAMS:
         engine.take(name, StreamNote(START_NS, name, BEGAN))
@@ -280,7 +281,7 @@ def test_the_evaluation_of_a_session_counts_equal_probabilities(
     with pytest.raises(UsageError, match="is not a recording of a live session"):
         evaluation.evaluate(opened, dataset(rig.recording))
     other = dataclasses.replace(session_recording(rig, model), attributes={"live_model": "sha256:b"})
-    with pytest.raises(UsageError, match="ran another model"):
+    with pytest.raises(UsageError, match="ran the model"):
         evaluation.evaluate(opened, dataset(other))
 
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
-from tacpipe.channels.schema import has_arrivals
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import Json
 from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory
+from tacpipe.live.rows import SynchronizedRows
 from tacpipe.live.stages import live_channels
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
@@ -28,8 +28,7 @@ from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.signals.resampling import GAP_NS
 from tacpipe.store.records import Step
-from tacpipe.synchronization.causal import Grid, GridRows
-from tacpipe.synchronization.placement import Placement
+from tacpipe.synchronization.causal import GridRows
 from tacpipe.tasks.forward import causal, headline
 from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -82,22 +81,6 @@ def _gap_ms(synchronize: Any, forecaster: Forecaster, stream: str) -> float:
     return float(stored.get(stream, GAP_NS / 1e6) if synchronize.gap_ms is None else synchronize.gap_ms)
 
 
-class Beginning(NamedTuple):
-    """The state from the start of a session that another chain needs to continue it."""
-
-    origin_ns: int  # first point of the grid
-    rest: tuple[float, ...]  # rest level of each channel
-
-    def to_json(self) -> Json:
-        """Return the JSON object that `from_json` reads."""
-        return self._asdict()
-
-    @classmethod
-    def from_json(cls, stored: Json) -> Beginning:
-        """Return the beginning that `to_json` stored."""
-        return cls(int(stored["origin_ns"]), tuple(map(float, stored["rest"])))
-
-
 class _Row(NamedTuple):
     """One row of the grid, before the rest level is subtracted."""
 
@@ -123,7 +106,7 @@ class LiveChain:
         forecaster: Forecaster,
         steps: Sequence[Step],
         layout: InputLayout,
-        beginning: Beginning | None = None,
+        beginning: Json | None = None,
         targets: Targets | None = None,
         quantiles: Sequence[int] = (),
         cameras: Mapping[str, LiveChannels | None] | None = None,
@@ -138,19 +121,20 @@ class LiveChain:
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
-        gap_ns = {stream: round(_gap_ms(sync, forecaster, stream) * 1e6) for stream in layout.readings}
-        origin_ns = None if beginning is None else beginning.origin_ns
-        self._arrivals = set(arrivals)
-        self._placements: dict[str, Placement] = {}
-        self._grid = Grid(layout.readings, layout.master, sync.timeline, sync.rate_hz, gap_ns, origin_ns)
+        gap_ns = {stream: round(_gap_ms(sync, forecaster, stream) * 1e6) for stream in layout.columns}
+        origin_ns = None if beginning is None else int(beginning["origin_ns"])
+        self._synchronized = SynchronizedRows(
+            layout.columns, layout.schemas, layout.master, sync, gap_ns, origin_ns, arrivals
+        )
+        self._grid = self._synchronized.grid
         if beginning is not None:
-            for stream, levels in layout.levels(beginning.rest).items():
+            for stream, levels in layout.levels(beginning["rest"]).items():
                 self._grid.continue_from(stream, levels)
         self._rolling = Rolling(forecaster, continues=beginning is not None)
         self._arm = Arm(forecaster.orientation)
         # rows collected until the rest level is known; None afterwards
         self._resting: list[_Row] | None = [] if beginning is None else None
-        self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
+        self._rest: Floats | None = None if beginning is None else np.array(beginning["rest"])
         self._rest_rows = "unknown" if beginning is None else "of an earlier process"
         self._plans = PlanHistory()
         self._late_plans = 0
@@ -168,7 +152,7 @@ class LiveChain:
         steps: Sequence[Step],
         layouts: Mapping[str, pa.Schema],
         master: str = "",
-        beginning: Beginning | None = None,
+        beginning: Json | None = None,
         plan_from: str = "",
         quantiles: Sequence[int] = (),
         *,
@@ -218,10 +202,8 @@ class LiveChain:
     @property
     def streams(self) -> tuple[str, ...]:
         """The names of the streams that are read; samples of others are ignored."""
-        readings = (
-            self._layout.readings if self._targets is None else {**self._layout.readings, self._targets.stream: None}
-        )
-        return tuple(readings)
+        plans = PLAN if self._targets is None else self._targets.stream
+        return tuple(dict.fromkeys([*self._layout.columns, *([plans] if self.reads_plan else [])]))
 
     @property
     def waiting(self) -> tuple[str, ...]:
@@ -280,10 +262,12 @@ class LiveChain:
         return self._rest
 
     @property
-    def beginning(self) -> Beginning | None:
+    def beginning(self) -> Json | None:
         """Grid and rest level, for a chain that continues the session; None until they are known."""
         origin_ns = self._grid.origin_ns
-        return None if self._rest is None or origin_ns is None else Beginning(origin_ns, tuple(self._rest.tolist()))
+        return (
+            None if self._rest is None or origin_ns is None else {"origin_ns": origin_ns, "rest": self._rest.tolist()}
+        )
 
     @property
     def rest_rows(self) -> str:
@@ -304,23 +288,18 @@ class LiveChain:
             self._targets.push(batch)
         if stream == PLAN:
             self._push_plans(batch)
-        elif stream in self._layout.readings and batch.num_rows:
+        elif stream in self._layout.columns and batch.num_rows:
             samples = batch
             if stream in self._cameras:
                 camera = self._cameras[stream]
                 if camera is None:
                     return
                 samples = camera.push(batch)
-            placement = self._placements.get(stream)
-            if placement is None:  # the first samples show whether a stream has a device clock
-                is_arrival = stream in self._arrivals or has_arrivals(samples.schema.field("t_ns"))
-                placement = self._placements[stream] = Placement(samples.schema, arrivals=is_arrival)
-            times, values = self._layout.samples(stream, samples, placement.columns)
-            self._grid.push(stream, *placement.place(times), values)
+            self._synchronized.push(stream, samples)
 
-    def continue_cameras(self, previous: LiveChain) -> None:
-        """Continue the channels of the cameras of an earlier chain of the session, which know the untouched gels."""
-        self._cameras = dict(previous._cameras)
+    def take_over(self, previous: LiveChain) -> None:
+        """Take the plans of an earlier chain of the session, and its cameras' channels, which know the untouched gels."""
+        self._cameras, self._plans, self._targets = dict(previous._cameras), previous._plans, previous._targets
 
     def plan(self, arrived_ns: int, t_ns: Times, poses: AnyFloats) -> None:
         """Set the planned motion that arrived at ``arrived_ns``; it replaces the previous plan.

@@ -19,8 +19,14 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Model, Recording
-from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.stages import RecordingsInMemory, extracted_streams, run_stages, streams_as_recorded
+from tacpipe.errors import TacpipeError
+from tacpipe.live.stages import (
+    RecordingsInMemory,
+    extracted_streams,
+    require_sessions,
+    run_stages,
+    streams_as_recorded,
+)
 from tacpipe.plugins.stage import Result
 from tacpipe.scores import headline
 from tacpipe.tasks.forward import evaluation
@@ -30,11 +36,9 @@ from tacpipe.tasks.forward.headline import LiveMetrics
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.chain import GridForecast, LiveChain
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
+from tacpipe.tasks.forward.live.messages import FORECAST
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.tracks import Levels, Track
-
-DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
-MODEL = "live_model"  # attribute of a recording: the digest of the model of its session
 
 
 class _Offline(NamedTuple):
@@ -50,7 +54,7 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     Raises `UsageError` if one has no stream ``forecast``, or its session ran another model. Errors of a recording begin
     with its name.
     """
-    check(model.digest, recordings)
+    require_sessions(model.digest, recordings, FORECAST)
     forecaster = Forecaster.load(model.files)
     steps = headlines.headline_steps(range(1, forecaster.horizon + 1))
     offline = {}
@@ -80,26 +84,6 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     return dataclasses.replace(result, files=files, notes=[*result.notes, *measures.sentences(live)])
 
 
-def check(digest: str, recordings: Dataset) -> None:
-    """Raise `UsageError` for recordings without a session, or of a session with another model than that of this digest.
-
-    The messages of another model describe nothing of this model and differ from its predictions in every row.
-    """
-    for name, recording in sorted(recordings.recordings.items()):
-        if "forecast" not in recording.streams:
-            raise UsageError(
-                f"{name} is not a recording of a live session: it has no stream forecast. Give what `tacpipe live -o` "
-                f"recorded, or leave --live out."
-            )
-        ran = recording.attributes.get(MODEL, digest)  # missing in recordings of other programs
-        if ran != digest:
-            raise UsageError(
-                f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}. Its published "
-                f"values are of that model. Give the model that the session ran, or leave --live out to evaluate this one "
-                f"on the same recordings."
-            )
-
-
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
@@ -109,7 +93,7 @@ def _session(
     """
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     levels = () if forecaster.quantiles is None else forecaster.quantiles.percents
-    session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
+    session = Published.from_stream(tables[FORECAST], forecaster.codec.channels, levels)
     chain = replay.build_chain(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
     forecasts = list(replay.iterate_forecasts(chain, tables))
     with_values = [forecast for forecast in forecasts if forecast.count is not None]

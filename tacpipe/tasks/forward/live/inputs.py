@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
+from tacpipe.arrays import AnyFloats, Floats, Indices, Times
 from tacpipe.channels import arm as poses
 from tacpipe.channels.schema import field_metadata, time_field
 from tacpipe.channels.streams import EVENTS, count_axes
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
-from tacpipe.live.decoding import BatchColumns
 from tacpipe.printable import listed
 from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tare_level
 from tacpipe.synchronization import streams
-from tacpipe.synchronization.causal import StreamColumns
 from tacpipe.synchronization.streams import may_be_signal
 from tacpipe.tasks.forward import headline, tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -67,8 +65,8 @@ class InputLayout:
     """Where the inputs of a forecaster are in the samples of a rig's streams."""
 
     master: str
-    columns: Mapping[str, Sequence[str]]  # stream -> columns that are read
-    readings: Mapping[str, StreamColumns]
+    columns: Mapping[str, list[str]]  # stream -> columns that are read
+    schemas: Mapping[str, pa.Schema]
     tactile_of: Mapping[str, tuple[Indices, Indices]]  # stream -> its columns and their channels
     axes: Mapping[str, int]  # stream -> axes of its taxels
     kinds: Mapping[str, np.dtype[Any]]  # stream -> type in which rest levels are computed
@@ -78,8 +76,6 @@ class InputLayout:
     finger: Place | None
     position_m: Floats  # (3,), size of each coordinate's unit in metres
     finger_scale_m: float
-    # stream -> indices of columns in batches
-    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)
 
     @classmethod
     def for_forecaster(
@@ -139,14 +135,10 @@ class InputLayout:
         opening = tracks.opening(grid)
         joints = (place_columns(angles), place_columns(speeds)) if has_joints else (None, None)
         finger = place_columns([opening] if opening else [])
-        readings = {
-            stream: StreamColumns.from_schema(signals[stream], names, synchronize, is_master=stream == leader)
-            for stream, names in columns.items()
-        }
         return cls(
             leader,
             columns,
-            readings,
+            signals,
             tactile_of,
             axes,
             kinds,
@@ -158,33 +150,6 @@ class InputLayout:
             poses.metres_per_unit(grid.field(opening)) if opening else 1.0,
         )
 
-    def samples(
-        self, stream: str, batch: pa.RecordBatch | pa.Table | BatchColumns, times: Sequence[str]
-    ) -> tuple[dict[str, Times], Floats]:
-        """Return the columns ``times`` (time,) by name and the required columns (time, column) of a batch of a stream.
-
-        Raises `TacpipeError` if a column is missing.
-        """
-        place = self._places.get(stream)
-        if place is None or place[0] is not batch.schema:
-            names = batch.schema.names
-            absent = [name for name in (*times, *self.columns[stream]) if name not in names]
-            if absent:
-                raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
-            place = (batch.schema, tuple(names.index(name) for name in (*times, *self.columns[stream])))
-            self._places[stream] = place
-        time_columns, value_columns = place[1][: len(times)], place[1][len(times) :]
-        stamps = {
-            name: _array(batch.column(number)).astype(np.int64, copy=False)
-            for name, number in zip(times, time_columns, strict=True)
-        }
-        if isinstance(batch, BatchColumns):
-            return stamps, batch.columns_of(tuple(value_columns))
-        values = np.empty((batch.num_rows, len(value_columns)))
-        for index, number in enumerate(value_columns):
-            values[:, index] = _array(batch.column(number))
-        return stamps, values
-
     def tactile(self, values: Mapping[str, Floats]) -> Floats:
         """Return the tactile channels (channel,) of a row, given as ``values`` (column,) by stream."""
         row = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
@@ -194,7 +159,7 @@ class InputLayout:
 
     def levels(self, rest_levels: Sequence[float]) -> dict[str, Floats]:
         """Return levels of channels (channel,) by stream as columns (column,), NaN for other columns."""
-        by_stream = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
+        by_stream = {name: np.full(len(names), np.nan) for name, names in self.columns.items()}
         for stream, (columns, channels) in self.tactile_of.items():
             by_stream[stream][columns] = np.asarray(rest_levels)[channels]
         return by_stream
@@ -264,8 +229,3 @@ def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Sc
     trained = str(forecaster.config["inputs"].get("unit", headline.COUNT))
     if unit != trained:
         raise TacpipeError(f"The tactile channels of this rig are in {unit}, and those of the model in {trained}.")
-
-
-def _array(column: Any) -> AnyArray:
-    """Return a column of a batch or a table as an array (time,)."""
-    return np.asarray(column)

@@ -136,7 +136,7 @@ def iterate_forecasts(chain: LiveChain, tables: Mapping[str, pa.Table]) -> Itera
 
     Samples are passed to ``chain`` in chunks, in the order of arrival.
     """
-    read = {name: tables[name] for name in (*chain.streams, PLAN) if name in tables}
+    read = {name: tables[name] for name in chain.streams if name in tables}
     for until_ns, pieces in pieces_by_arrival(read, chain.master):
         for name, piece in pieces.items():
             chain.push(name, piece)

@@ -86,6 +86,7 @@ class ForwardLive(LiveTask):
         Raises `UsageError` for steps that the model does not predict.
         """
         from tacpipe.live import plans
+        from tacpipe.live.decoding import likely_schema
         from tacpipe.tasks.forward.forecaster import Forecaster
         from tacpipe.tasks.forward.live.chain import LiveChain
         from tacpipe.tasks.forward.live.engine import ForecastEngine
@@ -96,7 +97,8 @@ class ForwardLive(LiveTask):
             LiveChain.for_model,
             forecaster,
             model.source.chain,
-            master=rig.master,
+            {name: likely_schema(sensor) for name, sensor in sensors.items()},
+            rig.master,
             plan_from=plans.target_stream(rig, own_settings.plan),
             quantiles=own_settings.quantiles,
             allow_look_ahead=settings.allow_look_ahead,
@@ -104,13 +106,13 @@ class ForwardLive(LiveTask):
 
         engine = ForecastEngine(
             sensors,
-            lambda layouts, beginning: open_chain(layouts, beginning=beginning),
+            open_chain,
             own_settings.steps or None,
             settle_ns=round(settings.settle_ms * 1e6),
             quantiles=own_settings.quantiles,
         )
-        if own_settings.steps and max(own_settings.steps) > engine.chain.horizon:
-            raise UsageError(f"The model predicts 1 to {engine.chain.horizon} steps ahead; give --steps of these.")
+        if own_settings.steps and max(own_settings.steps) > engine.rows.horizon:
+            raise UsageError(f"The model predicts 1 to {engine.rows.horizon} steps ahead; give --steps of these.")
         forecaster.prepare_single()
         return engine
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from tacpipe.arrays import Floats
+from tacpipe.io import Json
 from tacpipe.live.engine import SETTLE_NS
 from tacpipe.models.tensors import one_thread
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.learning import examples
 from tacpipe.tasks.learning.answers import Quantities
-from tacpipe.tasks.learning.live.engine import WindowEngine
 from tacpipe.tasks.learning.live.messages import (
     BAND,
     ClassDescription,
@@ -22,7 +22,7 @@ from tacpipe.tasks.learning.live.messages import (
     LearnedDescription,
     LearnedMessage,
 )
-from tacpipe.tasks.learning.live.windows import LiveRow, LiveWindows, RestLevels
+from tacpipe.tasks.learning.live.windows import LiveRow, LiveWindows, WindowEngine
 from tacpipe.tasks.learning.model import LearnedModel
 from tacpipe.tasks.learning.uncertainty import ClassProbabilities, ErrorQuantiles
 
@@ -46,11 +46,11 @@ class AnswerEngine(WindowEngine):
         self,
         model: LearnedModel,
         sensors: Mapping[str, Sensor],
-        open_windows: Callable[[RestLevels], LiveWindows],
+        open_windows: Callable[[Json | None], LiveWindows],
         *,
         settle_ns: int = SETTLE_NS,
     ) -> None:
-        """Start without samples; ``open_windows`` returns windows that know some levels at rest."""
+        """Start without samples; ``open_windows`` returns windows that continue a beginning, or begin if it is None."""
         super().__init__(sensors, open_windows, settle_ns=settle_ns)
         self._model = model
         uncertainty = model.uncertainty

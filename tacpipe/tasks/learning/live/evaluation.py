@@ -10,14 +10,13 @@ import numpy as np
 from tacpipe.arrays import Times
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Model, Recording
-from tacpipe.errors import UsageError
 from tacpipe.live.messages import summarize_latencies
+from tacpipe.live.stages import require_sessions
 from tacpipe.plugins.stage import Result
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 # a recording, the times of its answers (row,) and its published columns at these -> further figures
 Measure = Callable[[Recording, Times, Mapping[str, Any]], Mapping[str, Any]]
 
@@ -34,17 +33,9 @@ def evaluate(
     ``predict`` returns the answers that follow from a recording. Raises `UsageError` for a recording without a session, or
     of another model.
     """
+    require_sessions(model.digest, recordings, stream)
     sessions = {}
     for name, recording in sorted(recordings.recordings.items()):
-        if stream not in recording.streams or "latency" not in recording.streams:
-            raise UsageError(
-                f"{name} is not a recording of a live session with this model: it has no stream {stream}. Give what "
-                f"`tacpipe live -o` recorded, or leave --live out."
-            )
-        if recording.attributes.get(MODEL, model.digest) != model.digest:
-            raise UsageError(
-                f"The session of {name} ran another model. Give the model that it ran, or leave --live out."
-            )
         sessions[name] = _session(recording, recording.table(stream), predict(recording), measure)
     totals = {key: sum(session[key] for session in sessions.values()) for key in ("published", "compared", "equal")}
     notes = [

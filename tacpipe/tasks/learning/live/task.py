@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Model, Recording
+    from tacpipe.io import Json
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.sensor import Options, Sensor
     from tacpipe.store.records import Step
-    from tacpipe.tasks.learning.live.engine import WindowEngine
-    from tacpipe.tasks.learning.live.windows import LiveWindows, RestLevels
+    from tacpipe.tasks.learning.live.windows import LiveWindows, WindowEngine
     from tacpipe.tasks.learning.model import LearnedModel
     from tacpipe.tasks.task import PredictionRequest
 
@@ -124,7 +124,7 @@ def causal_answers(
     tables = streams_as_recorded(recording)
     schemas = {stream: table.schema for stream, table in tables.items()}
     master = str(recording.attributes.get("master") or model.config["master"])
-    windows = windows_for(model, chain, schemas, master, {}, arrival_streams(recording, tables))
+    windows = windows_for(model, chain, schemas, master, None, arrival_streams(recording, tables))
     rows = [row for row in replayed(windows, tables) if row.windows is not None]
     return model.to_table([row.t_ns for row in rows], outputs_of(model, rows), levels)
 
@@ -157,10 +157,10 @@ def windows_for(
     chain: Sequence[Step],
     schemas: Mapping[str, pa.Schema],
     master: str,
-    rest: RestLevels,
+    beginning: Json | None,
     arrivals: Collection[str] = (),
 ) -> LiveWindows:
-    """Return the windows of a model in streams with these ``schemas``, as they are recorded.
+    """Return the windows of a model in streams with these ``schemas``, which continue a beginning if it is not None.
 
     Raises `UsageError` if a stream or a channel is missing.
     """
@@ -169,5 +169,5 @@ def windows_for(
 
     synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
     if synchronize is None:
-        return RecordedWindows(model.inputs, rest)
-    return SynchronizedWindows(model.inputs, rest, synchronize, schemas, synchronize.master or master, arrivals)
+        return RecordedWindows(model.inputs, beginning)
+    return SynchronizedWindows(model.inputs, beginning, synchronize, schemas, synchronize.master or master, arrivals)

@@ -1,4 +1,4 @@
-"""Windows of the samples that have arrived so far, as a model reads them from the recording.
+"""Windows of the samples that have arrived so far, as a model reads them from the recording, and the engine on them.
 
 `RecordedWindows` are for models of recordings as they are, `SynchronizedWindows` for models of the output of `synchronize`,
 whose rows they compute as the samples arrive. The windows are those of the recording to the bit.
@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Times
-from tacpipe.channels.schema import has_arrivals
-from tacpipe.codecs import tactile
 from tacpipe.errors import UsageError
-from tacpipe.live.decoding import BatchColumns
+from tacpipe.io import Json
+from tacpipe.live.messages import Message
+from tacpipe.live.rows import ColumnReader, RowEngine, SynchronizedRows, read_times
 from tacpipe.live.stages import pieces_by_arrival
 from tacpipe.printable import listed
 from tacpipe.signals.resampling import GAP_NS
-from tacpipe.synchronization.causal import Grid, StreamColumns
-from tacpipe.synchronization.placement import Placement
 from tacpipe.synchronization.streams import grid_name
 from tacpipe.tasks.learning.inputs import Inputs, InputStream, fill_missing, measure_rest
 
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 SPARE_ROWS = 512  # number of rows that are retained in addition to a window
-RestLevels = Mapping[str, Sequence[float]]  # levels at rest (channel,) by stream
 
 
 class LiveRow(NamedTuple):
@@ -92,27 +89,42 @@ class StreamSoFar:
 class LiveWindows(ABC):
     """Windows of a session or of a replayed recording, in the order of time."""
 
-    def __init__(self, inputs: Inputs, rest: RestLevels, master: str) -> None:
-        """Start without samples; ``rest`` are levels at rest that were measured before.
+    def __init__(self, inputs: Inputs, beginning: Json | None, master: str) -> None:
+        """Start without samples; ``beginning`` has the levels at rest that were measured before.
 
         The samples of ``master`` make the rows.
         """
+        levels = beginning["rest"] if beginning else {}
         self.by_stream: Mapping[str, StreamSoFar] = {
-            stream.stream: StreamSoFar(stream, inputs.rest_ns, rest.get(stream.stream)) for stream in inputs.streams
+            stream.stream: StreamSoFar(stream, inputs.rest_ns, levels.get(stream.stream)) for stream in inputs.streams
         }
         self.master = master
-        self.late = 0  # number of samples that came after the row that should have read them
         self._start_ns: int | None = None
-        self._places: dict[str, tuple[int, ...]] = {}  # stream -> columns of its channels in `BatchColumns`
+
+    @property
+    def beginning(self) -> Json | None:
+        """The levels at rest by stream; None until all are measured."""
+        levels = {name: so_far.rest for name, so_far in self.by_stream.items()}
+        measured = {name: level.tolist() for name, level in levels.items() if level is not None}
+        return {"rest": measured} if len(measured) == len(levels) else None
 
     @property
     @abstractmethod
     def streams(self) -> Collection[str]:
         """The streams whose samples are read."""
 
+    @property
+    @abstractmethod
+    def late(self) -> Mapping[str, int]:
+        """The number of samples that came after the row that should have read them, by stream."""
+
     @abstractmethod
     def push(self, stream: str, samples: Any) -> None:
         """Add samples of a stream, a table or `BatchColumns`, in the order of arrival."""
+
+    def take_over(self, previous: LiveWindows) -> None:
+        """Take what earlier windows of the session know beside their beginning: nothing, unless a task adds it."""
+        return
 
     @abstractmethod
     def rows(self, until_ns: int) -> list[LiveRow]:
@@ -125,28 +137,27 @@ class LiveWindows(ABC):
         windows = [window for window in found.values() if window is not None]
         return LiveRow(t_ns, arrival_ns, self._start_ns or t_ns, None if missing else windows, missing)
 
-    def _values(self, stream: str, samples: Any, channels: Sequence[str]) -> AnyFloats:
-        """Return the channels (time, channel) of samples."""
-        if not isinstance(samples, BatchColumns):
-            return tactile.matrix(samples, channels)
-        if stream not in self._places:
-            self._places[stream] = tuple(samples.schema.get_field_index(name) for name in channels)
-        return samples.columns_of(self._places[stream])
-
 
 class RecordedWindows(LiveWindows):
     """A row at each sample of the first stream, with the newest samples of every stream."""
 
-    def __init__(self, inputs: Inputs, rest: RestLevels) -> None:
-        """Start without samples; ``rest`` are levels at rest that were measured before."""
-        super().__init__(inputs, rest, inputs.streams[0].stream)
+    def __init__(self, inputs: Inputs, beginning: Json | None) -> None:
+        """Start without samples; ``beginning`` has the levels at rest that were measured before."""
+        super().__init__(inputs, beginning, inputs.streams[0].stream)
         self._pending: deque[int] = deque()  # times of samples of the first stream that made no row yet
+        self._reader = ColumnReader()
+        self._late = dict.fromkeys(self.by_stream, 0)
         self.read_ns = 0  # time of the newest row; 0 before the first one
 
     @property
     def streams(self) -> Collection[str]:
         """The input streams."""
         return tuple(self.by_stream)
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """The number of samples that came after the row that should have read them, by stream."""
+        return self._late
 
     def push(self, stream: str, samples: Any) -> None:
         """Add samples of a stream in the order of arrival."""
@@ -155,8 +166,8 @@ class RecordedWindows(LiveWindows):
         if len(t_ns):
             first_ns = int(t_ns[0])
             self._start_ns = first_ns if self._start_ns is None else min(self._start_ns, first_ns)
-        self.late += int((t_ns <= self.read_ns).sum())
-        so_far.add(t_ns, self._values(stream, samples, so_far.stream.channels))
+        self._late[stream] += int((t_ns <= self.read_ns).sum())
+        so_far.add(t_ns, self._reader.read(stream, samples, so_far.stream.channels))
         if stream == self.master:
             self._pending.extend(t_ns.tolist())
 
@@ -181,7 +192,7 @@ class SynchronizedWindows(LiveWindows):
     def __init__(
         self,
         inputs: Inputs,
-        rest: RestLevels,
+        beginning: Json | None,
         synchronize: Any,
         schemas: Mapping[str, pa.Schema],
         master: str,
@@ -191,43 +202,30 @@ class SynchronizedWindows(LiveWindows):
 
         Raises `UsageError` if a stream or a channel that the model reads is missing.
         """
-        super().__init__(inputs, rest, master)
-        self._arrivals = set(arrivals)
-        self._columns: dict[str, list[str]] = {master: []}
+        super().__init__(inputs, beginning, master)
+        columns: dict[str, list[str]] = {master: []}
         for stream in inputs.streams:
-            self._columns[stream.stream] = _recorded_names(stream, schemas)
-        if master not in schemas:
-            raise UsageError(
-                f"The rows of the model are those of the stream {master}, and there are {listed(schemas)}."
-            )
-        readings = {
-            name: StreamColumns.from_schema(schemas[name], names, synchronize, is_master=name == master)
-            for name, names in self._columns.items()
-        }
-        gap_ns = dict.fromkeys(readings, GAP_NS)
-        self._grid = Grid(readings, master, synchronize.timeline, synchronize.rate_hz, gap_ns)
-        self._placements: dict[str, Placement] = {}
+            columns[stream.stream] = _recorded_names(stream, schemas)
+        gap_ns = dict.fromkeys(columns, GAP_NS)
+        self._synchronized = SynchronizedRows(columns, schemas, master, synchronize, gap_ns, arrivals=arrivals)
 
     @property
     def streams(self) -> Collection[str]:
         """The input streams, and the stream whose samples make the rows."""
-        return tuple(self._columns)
+        return tuple(self._synchronized.columns)
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """The number of samples that came after the row that should have read them, by stream."""
+        return self._synchronized.grid.late
 
     def push(self, stream: str, samples: Any) -> None:
         """Add samples of a stream in the order of arrival."""
-        if not samples.num_rows:
-            return
-        placement = self._placements.get(stream)
-        if placement is None:  # the first samples show whether a stream has a device clock
-            is_arrival = stream in self._arrivals or has_arrivals(samples.schema.field("t_ns"))
-            placement = self._placements[stream] = Placement(samples.schema, arrivals=is_arrival)
-        times = {name: read_times(samples, name) for name in placement.columns}
-        self._grid.push(stream, *placement.place(times), self._values(stream, samples, self._columns[stream]))
+        self._synchronized.push(stream, samples)
 
     def rows(self, until_ns: int) -> list[LiveRow]:
         """Return the rows up to a time."""
-        grid = self._grid.rows(until_ns)
-        self.late = sum(self._grid.late.values())
+        grid = self._synchronized.rows(until_ns)
         kept = np.flatnonzero(grid.has_samples)
         if not len(kept):
             return []
@@ -239,9 +237,22 @@ class SynchronizedWindows(LiveWindows):
         return [self._row(int(grid.t_ns[index]), int(grid.arrival_ns[index])) for index in kept]
 
 
-def read_times(samples: Any, name: str) -> Times:
-    """Return a column of times or counters (time,) of a table or of `BatchColumns`."""
-    return np.asarray(samples.column(name)).astype(np.int64, copy=False)
+class WindowEngine(RowEngine[LiveWindows]):
+    """A live session with a model that answers windows, one answer per row. A task adds the message."""
+
+    def advance(self, until_ns: int) -> Sequence[LiveRow]:
+        """Return the rows up to a time."""
+        return self.rows.rows(until_ns)
+
+    def message(self, row: LiveRow) -> Message:
+        """Return the message for a row, with a cause if a window is not full."""
+        if row.windows is None:
+            return self.no_answer(row.t_ns, self._why or f"the window of {', '.join(row.missing)} is being filled")
+        return self.answer(row)
+
+    @abstractmethod
+    def answer(self, row: LiveRow) -> Message:
+        """Return the message with the answer to the full windows of a row."""
 
 
 def replayed(windows: LiveWindows, tables: Mapping[str, pa.Table]) -> Iterator[LiveRow]:

@@ -18,9 +18,9 @@ from tacpipe.arrays import Float32s
 from tacpipe.channels.streams import EVENTS, finger_stream
 from tacpipe.datasets.dataset import Dataset, Model, Recording
 from tacpipe.errors import TacpipeError
-from tacpipe.live.stages import stage_params, streams_as_recorded
+from tacpipe.live.stages import RecordingInMemory, stage_params, streams_as_recorded
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import Attribute, RecordingOutput, Result
+from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.tasks.material import slides as slides_of
@@ -59,25 +59,11 @@ def slide_params(steps: Sequence[Step]) -> Any:
     return params_found
 
 
-@dataclass(frozen=True)
-class RecordingSoFar:
-    """Streams of a recording so far, with the interface that stages read."""
+class RecordingSoFar(RecordingInMemory):
+    """Streams of a recording so far, which are decoded already."""
 
-    tables: Mapping[str, pa.Table]
-    attributes: Mapping[str, Attribute]
-    name: str = "so far"
-
-    @property
-    def streams(self) -> tuple[str, ...]:
-        """Names of the streams."""
-        return tuple(self.tables)
-
-    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
-        """Return a stream, or some of its columns."""
-        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
-
-    def columns(self, stream: str = "") -> pa.Table:
-        """Return a stream, which is decoded already."""
+    def columns(self, stream: str = "") -> Any:
+        """Return a stream."""
         return self.tables[stream]
 
 
@@ -122,7 +108,7 @@ class SlideSoFar:
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
         """Return the prediction for a recording of these streams that ends now, or why there is none."""
-        recording = RecordingSoFar(streams, self._attributes)
+        recording = RecordingSoFar("so far", streams, self._attributes)
         try:
             segmented = self._stage(replace(self._params, crop="none"), recording)
         except TacpipeError:
@@ -163,7 +149,7 @@ class SlideSoFar:
         if finger_stream not in tables:
             return False
         try:
-            recording = RecordingSoFar(tables, self._attributes)
+            recording = RecordingSoFar("so far", tables, self._attributes)
             slide = self._stage(replace(self._params, crop="none"), recording).streams[STREAM]
         except TacpipeError:  # no slide has started
             return False
@@ -181,9 +167,9 @@ class SlideSoFar:
         first = params.offset_frames if params.crop == "offset" else 0
         if params.crop == "none" or table.num_rows - first >= params.frames:
             slide = self._stage(params, recording)
-            return RecordingSoFar(slide.streams, {**recording.attributes, **slide.attributes}), False
+            return RecordingSoFar("so far", slide.streams, {**recording.attributes, **slide.attributes}), False
         remaining = table.slice(min(first, table.num_rows))
-        return RecordingSoFar({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
+        return RecordingSoFar("so far", {STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
 
 
 MOMENT_NS = 100_000_000  # interval between checks of a part, starting at the finger's first sample
