@@ -31,7 +31,7 @@ EXEMPT = {  # stages that need not account for rows, and why
 }
 # streams that are opened for their schema or their labels, while the rows of other streams are used
 LABELS_ONLY = {"train.slip": {"events", "robot", "proximity", "truth", "plan"}}
-LEARNING = ("train", "evaluate", "calibrate", "compress", "extract", "predict")
+LEARNING = ("train", "evaluate", "calibrate", "recentre", "compress", "extract", "predict")
 STAGES = [name for name in registry.stages() if name not in EXEMPT]
 
 

@@ -51,7 +51,7 @@ SECTIONS = {  # commands in the order of ``tacpipe --help``; stages from other p
     "Record": ("acquire", "live", "sensors"),
     "Import and export": ("ingest", "simulate", "export"),
     "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
-    "Train and evaluate": ("train", "calibrate", "evaluate", "predict", "compare", "report", "track"),
+    "Train and evaluate": ("train", "calibrate", "recentre", "evaluate", "predict", "compare", "report", "track"),
     "Look": ("show", "check", "view", "explain", "candidates"),
     "Manage": ("store", "demo", "version"),
 }

@@ -125,6 +125,7 @@ class Loop:
         self.cause = message.cause
         if message.answers:
             self.forecasts += 1
+        if message.answers and math.isfinite(message.latency_ms):  # an answer about an ended recording has no latency
             self.latencies.add(message.latency_ms)
 
     def _stamp(self, message: Message) -> None:

@@ -98,6 +98,14 @@ class Task(ABC):
         return None
 
     @property
+    def recentre(self) -> Callable[[Files, Dataset], Result] | None:
+        """Function of a model's files and recordings of a session that returns the model with the levels of the session.
+
+        None if its models do not read levels of sessions.
+        """
+        return None
+
+    @property
     def live(self) -> LiveTask | None:
         """The task's part of live sessions; None if its models do not run live."""
         return None

@@ -72,7 +72,7 @@ def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[st
     if interrupt:
         process.send_signal(signal.SIGINT)
     out, err = process.communicate()
-    assert process.returncode == 0, err
+    assert process.returncode == 0 and "Traceback" not in err, err
     printed: dict[str, Any] = json.loads(out)
     return printed
 

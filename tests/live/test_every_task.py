@@ -24,6 +24,7 @@ from tacpipe.sensors.encoding import split_frames
 from tacpipe.sensors.framing import Chunks
 from tacpipe.tasks.classify.params import ClassifyLinear
 from tacpipe.tasks.forward import training as forward_training
+from tacpipe.tasks.learning.model import recentre
 from tacpipe.tasks.regress.params import RegressBoosting
 from tacpipe.tasks.slip.params import SlipBoosting
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
@@ -206,7 +207,7 @@ def forward_case(folder: Path) -> Case:
 
 def labelled(seed: int) -> FakeShard:
     """Return the synchronized rows of a recording with a target and a label."""
-    shard = stage("synchronize", skin_recording(seed))
+    shard = stage("synchronize", skin_recording(seed, session="today"))
     values = shard.content["left_taxel01_z"].to_numpy().astype(float)
     table = shard.content.append_column(pa.field("force", pa.float64(), metadata={"unit": "N"}), pa.array(values))
     return dataclasses.replace(
@@ -216,6 +217,8 @@ def labelled(seed: int) -> FakeShard:
 
 def learned_case(task: str, params: Any, folder: Path) -> Case:
     files = registry.load_task(task).train.function(params, dataset(labelled(0)), None, folder).files
+    if params.recentre:
+        files = recentre(files, dataset(labelled(5))).files
     names = ["force"] if task == "regress" else ["0", "1"]
     prefix = "" if task == "regress" else "probability_"
     return Case(
@@ -253,7 +256,7 @@ CASES: dict[str, Callable[[Path], Case]] = {
         learned_case, "regress", RegressBoosting(target="force", context_s=0.1, rest_s=0.1, trees=10, inputs="*_taxel*")
     ),
     "classify": functools.partial(
-        learned_case, "classify", ClassifyLinear(label="phase", context_s=0.1, inputs="*_taxel*")
+        learned_case, "classify", ClassifyLinear(label="phase", context_s=0.1, inputs="*_taxel*", recentre="session")
     ),
     "slip": slip_case,
     "material": material_case,

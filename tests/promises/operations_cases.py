@@ -298,6 +298,15 @@ STAGES = (
         (*FORWARD[:3], "split data/c -o data/split --scheme random --val 0.25 --test 0.25"),
     ),
     Case("calibrate", "calibrate models/f data/c --split data/split -o models/g", FORWARD[:5]),
+    Case(
+        "recentre",
+        "recentre models/n data/c -o models/g",
+        (
+            *FORWARD[:4],
+            "train classify data/c --split data/split -o models/n --label contact --architecture linear "
+            "--recentre contact",
+        ),
+    ),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
     Case("report", "report results/f -o report.html", FORWARD),
     *_export(("card", "csv", "hdf5", "mcap"), "data/r", EVEN[:1]),

@@ -101,7 +101,9 @@ def _notes(model: LearnedModel, answered: Answered) -> list[str]:
         )
     if model.config["chosen_is_baseline"]:
         notes.append(f"The model is the baseline {model.config['chosen'].replace('_', ' ')}; no estimator was better.")
-    if model.params.recentre:
+    if level_from := model.config.get("level_from"):
+        notes.append(f"The level of {listed(level_from, 3)} was subtracted.")
+    elif model.params.recentre:
         notes.append(
             f"The median over all rows of each {model.params.recentre} was subtracted, which a live session cannot know."
         )

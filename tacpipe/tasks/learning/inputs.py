@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class StreamConfig(TypedDict):
     rows: int  # number of rows of a window
     rate_hz: float
     scale: list[float]  # (channel,), the divisor of values above rest
+    level: NotRequired[list[float]]  # (channel,), the scaled level of a session, which is subtracted
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class InputStream:
     rows: int  # number of rows of a window
     rate_hz: float
     scale: Floats  # (channel,)
+    level: Floats | None = None  # (channel,), the scaled level of a session, which is subtracted
 
     @classmethod
     def from_config(cls, config: StreamConfig) -> InputStream:
@@ -52,12 +54,15 @@ class InputStream:
         channels, scale = tuple(config["channels"]), np.array(config["scale"], np.float64)
         if not (0 < config["rows"] <= MAX_ROWS and len(config["layout"]) == len(channels) == len(scale) > 0):
             raise ValueError(f"the stream {config['stream']} has {config['rows']} rows and {len(scale)} scales")
-        return cls(config["stream"], channels, tuple(config["layout"]), config["rows"], config["rate_hz"], scale)
+        level = np.array(config["level"], np.float64) if "level" in config else None
+        if level is not None and len(level) != len(channels):
+            raise ValueError(f"the stream {config['stream']} has {len(channels)} channels and {len(level)} levels")
+        return cls(config["stream"], channels, tuple(config["layout"]), config["rows"], config["rate_hz"], scale, level)
 
     def to_config(self) -> StreamConfig:
         """Return the stream as ``config.json`` has it."""
         layout = [dict(place) for place in self.layout]
-        return {
+        config: StreamConfig = {
             "stream": self.stream,
             "channels": list(self.channels),
             "layout": layout,
@@ -65,6 +70,11 @@ class InputStream:
             "rate_hz": self.rate_hz,
             "scale": self.scale.tolist(),
         }
+        return config if self.level is None else {**config, "level": self.level.tolist()}
+
+    def centred(self, values: AnyFloats) -> AnyFloats:
+        """Return scaled values (row, channel) without the level of the session, if the model has one."""
+        return values if self.level is None else values - self.level
 
 
 @dataclass(frozen=True)
@@ -120,7 +130,7 @@ class RawStream:
             return StreamRows(self.t_ns, np.zeros_like(self.values), len(self.t_ns))
         rest, count = measured
         scaled = (self.values - rest) / stream.scale
-        return StreamRows(self.t_ns, fill_missing(scaled, np.zeros(len(stream.scale))), count)
+        return StreamRows(self.t_ns, stream.centred(fill_missing(scaled, np.zeros(len(stream.scale)))), count)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,12 @@ import pyarrow as pa
 from tacpipe.arrays import AnyFloats, Indices
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
+from tacpipe.plugins.rows import NO_WINDOW, RowCounts, count_rows
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.printable import listed
 from tacpipe.tasks import recordings as recordings_of
 from tacpipe.tasks.learning import examples as examples_of
 from tacpipe.tasks.learning import storage
@@ -79,7 +81,8 @@ class LearnedModel:
     def rows(self, recordings: Sequence[Recording]) -> list[InputRows]:
         """Return the rows of recordings, re-centred if the model was trained so."""
         rows = [self.inputs.read(recording) for recording in recordings]
-        return examples_of.recentre(rows, self.params.recentre) if self.params.recentre else rows
+        is_open = self.params.recentre and "level_from" not in self.config
+        return examples_of.recentre(rows, self.params.recentre) if is_open else rows
 
     def labelled(self, recordings: Sequence[Recording]) -> Examples:
         """Return the windows of recordings whose answer is known."""
@@ -156,6 +159,38 @@ def predict(files: Mapping[str, bytes], recordings: Dataset, quantiles: Sequence
     """Return one table of predictions per recording. Raises `TacpipeError` if a recording lacks inputs of the model."""
     model = LearnedModel.load(files)
     return Result({name: RecordingOutput(table) for name, table in model.tables(recordings, quantiles).items()})
+
+
+def recentre(files: Mapping[str, bytes], recordings: Dataset) -> Result:
+    """Return the files of a model that subtracts the median over all rows of these recordings of one session.
+
+    Raises `UsageError` if the model was trained without ``--recentre``, or the recordings are of several sessions.
+    """
+    model = LearnedModel.load(files)
+    label = model.params.recentre
+    if not label:
+        raise UsageError(
+            "The model reads levels as they are. Train it with --recentre session to adapt it to a session."
+        )
+    opened = [recording for _, recording in sorted(recordings.recordings.items())]
+    sessions = sorted({str(recording.attributes[label]) for recording in opened if label in recording.attributes})
+    if len(sessions) > 1:
+        raise UsageError(f"The recordings are of several values of {label}, {listed(sessions, 3)}. Give those of one.")
+    read = replace(model.inputs, streams=tuple(replace(stream, level=None) for stream in model.inputs.streams))
+    rows = [read.read(recording) for recording in opened]
+    streams = [
+        replace(
+            stream, level=np.median(np.concatenate([each.streams[place].values for each in rows]), axis=0)
+        ).to_config()
+        for place, stream in enumerate(read.streams)
+    ]
+    for each in rows:
+        for stream, samples in zip(read.streams, each.streams, strict=True):
+            count_rows(each.name, stream.stream, RowCounts.from_masks(np.ones(len(samples.t_ns), bool), [], NO_WINDOW))
+    config = {**model.config, "inputs": streams, "level_from": [recording.name for recording in opened]}
+    count = sum(len(each.streams[0].values) for each in rows)
+    note = f"The level is the median of {count:,} rows of {listed([recording.name for recording in opened], 3)}."
+    return Result(files={**files, model_files.CONFIG: model_files.to_json(config)}, notes=[note])
 
 
 def calibrate(

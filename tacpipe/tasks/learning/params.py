@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired
 
 from tacpipe.plugins.constraints import Names, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Seed, Unit
 from tacpipe.plugins.params import Panels
@@ -205,3 +205,4 @@ class LearnedConfig(ModelConfig):
     calibration: dict[str, Any]
     group: list[str]  # labels by which recordings are grouped
     counts: dict[str, int]  # numbers of training recordings, groups and windows
+    level_from: NotRequired[list[str]]  # recordings whose median the model subtracts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from tacpipe.plugins.stage import Result
@@ -43,6 +44,13 @@ class LearnedTask(Task):
         from tacpipe.tasks.learning.model import calibrate
 
         return Calibration(self.states, calibrate)
+
+    @property
+    def recentre(self) -> Callable[[Files, Dataset], Result]:
+        """Measurement of the levels of a session."""
+        from tacpipe.tasks.learning.model import recentre
+
+        return recentre
 
     @property
     def report(self) -> TaskReport:

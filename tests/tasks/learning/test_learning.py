@@ -28,7 +28,7 @@ from tacpipe.tasks.learning.estimators import (
     load,
 )
 from tacpipe.tasks.learning.inputs import InputRows, find_inputs
-from tacpipe.tasks.learning.model import LearnedModel, calibrate
+from tacpipe.tasks.learning.model import LearnedModel, calibrate, recentre
 from tacpipe.tasks.learning.uncertainty import ErrorQuantiles
 from tacpipe.tasks.regress.params import RegressAuto, RegressBoosting, RegressLinear, RegressTrees
 from tacpipe.tasks.regress.task import RegressTask
@@ -261,13 +261,20 @@ def test_recentred_sessions_are_compared_without_their_own_levels(tmp_path: Path
     first = [recording for recording in recordings if recording.attributes["session"] == "day-0"]
     second = [recording for recording in recordings if recording.attributes["session"] == "day-1"]
     right = {}
-    for recentre in ("", "session"):
-        model = trained(ClassifyLinear(label="shape", recentre=recentre), first, tmp_path)
+    for label in ("", "session"):
+        model = trained(ClassifyLinear(label="shape", recentre=label), first, tmp_path)
         tables: Any = model.tables(dataset(*second))
-        right[recentre] = np.mean(
-            [tables[each.name]["shape"][0].as_py() == each.attributes["shape"] for each in second]
-        )
+        right[label] = np.mean([tables[each.name]["shape"][0].as_py() == each.attributes["shape"] for each in second])
     assert right["session"] > right[""] + 0.2
+    files = files_of(ClassifyLinear(label="shape", recentre="session"), first, tmp_path)
+    adapted = recentre(files, dataset(*second))
+    assert adapted.notes[0].startswith("The level is the median of ")
+    again: Any = LearnedModel.load(recentre(adapted.files, dataset(*second)).files).tables(dataset(*second))
+    assert all(again[name].equals(table) for name, table in tables.items())
+    with pytest.raises(UsageError, match="several values of session, day-0, day-1"):
+        recentre(adapted.files, dataset(*recordings))
+    with pytest.raises(UsageError, match="Train it with --recentre session"):
+        recentre(files_of(ClassifyLinear(label="shape"), first, tmp_path), dataset(*second))
 
 
 @pytest.mark.parametrize(

@@ -165,13 +165,13 @@ def test_a_rig_without_a_stream_or_channel_of_the_model_is_refused(skins: Skins,
 def test_a_model_of_rows_that_a_session_cannot_compute_does_not_run_live() -> None:
     other: Any = {**SYNCHRONIZE, "stage": "segment.slides"}
     with pytest.raises(TacpipeError, match="trained on the output of `tacpipe segment slides`"):
-        check_causal([other], {}, allow_look_ahead=False)
+        check_causal([other], {"params": {}}, allow_look_ahead=False)
     with pytest.raises(TacpipeError, match="median over all rows of each session"):
-        check_causal([SYNCHRONIZE], {"recentre": "session"}, allow_look_ahead=False)
+        check_causal([SYNCHRONIZE], {"params": {"recentre": "session"}}, allow_look_ahead=False)
     ahead: Any = {**SYNCHRONIZE, "params": {**SYNCHRONIZE["params"], "values": "interpolate"}}
     with pytest.raises(TacpipeError, match="no later samples"):
-        check_causal([ahead], {}, allow_look_ahead=False)
-    check_causal([ahead], {}, allow_look_ahead=True)
+        check_causal([ahead], {"params": {}}, allow_look_ahead=False)
+    check_causal([ahead], {"params": {}}, allow_look_ahead=True)
 
 
 def test_causal_predictions_of_a_recording_are_those_of_its_synchronized_rows(skins: Skins, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class LearnedLive(LiveTask):
         Raises `TacpipeError` if the model reads what a session cannot know, and `UsageError` if the rig lacks a stream.
         """
         config = model_files.tree(model.files, model_files.CONFIG, {"inputs": list, "answers": dict, "params": dict})
-        check_causal(model.source.chain, config["params"], allow_look_ahead=settings.allow_look_ahead)
+        check_causal(model.source.chain, config, allow_look_ahead=settings.allow_look_ahead)
         for stream in config["inputs"]:
             if stream["stream"] not in rig.streams:
                 raise UsageError(
@@ -81,7 +81,7 @@ class LearnedLive(LiveTask):
 
         loaded = LearnedModel.load(model.files)
         chain = model.source.chain
-        check_causal(chain, loaded.config["params"], allow_look_ahead=request.allow_look_ahead)
+        check_causal(chain, loaded.config, allow_look_ahead=request.allow_look_ahead)
         levels = loaded.quantile_places(request.quantiles)
         return Result(
             {
@@ -129,7 +129,7 @@ def causal_answers(
     return model.to_table([row.t_ns for row in rows], outputs_of(model, rows), levels)
 
 
-def check_causal(chain: Sequence[Step], params: Mapping[str, Any], *, allow_look_ahead: bool) -> None:
+def check_causal(chain: Sequence[Step], config: Mapping[str, Any], *, allow_look_ahead: bool) -> None:
     """Raise `TacpipeError` for a model of rows that a session cannot compute, or that looks ahead."""
     from tacpipe.live.stages import stage_params
 
@@ -139,10 +139,11 @@ def check_causal(chain: Sequence[Step], params: Mapping[str, Any], *, allow_look
                 f"The model was trained on the output of `tacpipe {step['stage'].replace('.', ' ')}`, which a session does "
                 f"not run. Train it on recordings, or on the output of `tacpipe synchronize`."
             )
-    if params.get("recentre"):
+    params = config["params"]
+    if params.get("recentre") and "level_from" not in config:
         raise TacpipeError(
-            f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Train "
-            f"it without --recentre."
+            f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Run "
+            f"`tacpipe recentre MODEL RECORDINGS -o ADAPTED` on recordings of the session, and give the model that it writes."
         )
     synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
     if synchronize is not None and synchronize.values == "interpolate" and not allow_look_ahead:

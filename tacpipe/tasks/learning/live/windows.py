@@ -68,7 +68,10 @@ class StreamSoFar:
         scaled = fill_missing((values - self.rest) / self.stream.scale, self._filled)
         if len(scaled):
             self._filled = scaled[-1]
-        self.t_ns, self.values = np.concatenate([self.t_ns, times]), np.concatenate([self.values, scaled])
+        self.t_ns, self.values = (
+            np.concatenate([self.t_ns, times]),
+            np.concatenate([self.values, self.stream.centred(scaled)]),
+        )
         retained_rows = self.stream.rows + SPARE_ROWS
         if len(self.t_ns) > 2 * retained_rows:
             self._dropped += len(self.t_ns) - retained_rows

@@ -19,6 +19,7 @@ from tacpipe.live.decoding import BatchColumns, likely_schema
 from tacpipe.live.engine import SETTLE_NS
 from tacpipe.live.messages import Message
 from tacpipe.live.rows import RowEngine
+from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
 from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, SlideSplitter, rows_after, rows_until
@@ -165,6 +166,11 @@ class MaterialEngine(RowEngine[Slides]):
     def end_stream(self, stream: str) -> None:
         """Mark a stream as ended for the recording."""
         self._ended_streams.add(stream)
+
+    def take_chunks(self, stream: str, chunks: Chunks) -> None:
+        """Store bytes of a stream that has not ended; those after its end are not in the recording."""
+        if stream not in self._ended_streams:
+            super().take_chunks(stream, chunks)
 
     def due_ns(self, now_ns: int) -> int:
         """Return the monotonic time of the next call of `step`."""
