@@ -32,7 +32,7 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
 
     Raises `UsageError` for invalid options, and `DeviceError` if streams do not open or send nothing.
     """
-    from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording import appending, scheduling, trials, triggers
     from tacpipe.recording.pictures import serve_pictures
     from tacpipe.recording.recorder import Recorder, complete_rig
     from tacpipe.recording.watch import RigView
@@ -44,10 +44,12 @@ def record(rig: Rig, store: Store, plan: RecordingPlan, *, quiet: bool) -> tuple
         raise UsageError("--trials and --duration-s must be above 0.")
     if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
         raise UsageError("--trials needs --duration-s or --stop, because otherwise the first trial never ends.")
+    if plan.realtime:
+        scheduling.check_realtime()
     store.prepare()
     directory.check_output(store, plan.output)
     appending.refuse_existing_names(plan.output, plan.names)
-    recorder = Recorder(complete_rig(rig))
+    recorder = Recorder(complete_rig(rig), realtime=plan.realtime)
     with (
         EndRequest() as is_over,
         recorder.open(),

@@ -421,6 +421,12 @@ PREPARED = {  # commands that must run before the example of a command
     ),
     "train classify": ("split data/grasps -o data/grasps-split --stratify object",),
     "train material": ("split data/slides -o data/slides-split --stratify sensor,material",),
+    "recentre": (
+        "simulate touch --trials 4 --objects 1 -o data/pinched-today",
+        "segment grasps data/pinched-today -o data/today",
+        "train classify data/grasps --split data/grasps-split --label object --architecture linear --recentre sensor "
+        "-o models/object",
+    ),
     "compare": ("evaluate models/forward data/segments --split data/split -o results/forward-gru",),
 }
 SHORT = """

@@ -88,6 +88,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "train touch data/grasps --split data/grasps-split -o {o}": "learn",
     "evaluate models/forward data/latents --rerun -o {o}": "learn",
     "calibrate models/forward data/latents --split data/split -o {o}": "learn",
+    "recentre models/force data/synced -o {o}": "learn",
     "predict models/forward data/latents -o {o}": "learn",
     "report results/forward -o {o}.html --traces 1": "learn",
     "ingest hdf5 arrays -o {o}": "hdf5",
@@ -149,6 +150,8 @@ INPUTS = (
     "simulate touch --trials 5 --families box --objects 1 -o data/pinched",
     "segment grasps data/pinched -o data/grasps",
     "split data/grasps -o data/grasps-split --scheme random",
+    "train regress data/synced --split data/split --target gt_force_z_n --architecture linear --recentre sensor "
+    "-o models/force",
     "store push elsewhere data/split",
 )
 

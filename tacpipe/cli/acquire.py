@@ -72,6 +72,9 @@ def add(program: typer.Typer, help_text: str) -> None:
         pictures: Annotated[
             int | None, typer.Option("--pictures", help="Port at which a browser on this computer shows the cameras.")
         ] = None,
+        realtime: Annotated[
+            bool, typer.Option("--realtime", help="Record before ordinary programs, if the system allows it.")
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
@@ -108,6 +111,7 @@ def add(program: typer.Typer, help_text: str) -> None:
             keep_spool,
             trials_of.attributes(label or [], note),
             pictures,
+            realtime,
         )
         recorded, lost = commands.record(parsed_rig, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))

@@ -157,7 +157,7 @@ def _run(
         store.prepare()
         directory.check_output(store, output)
         appending.refuse_existing_names(output, plan.names)
-    recorder = Recorder(prepared.rig)
+    recorder = Recorder(prepared.rig, realtime=prepared.options.settings.realtime)
     recorded: list[Any] = []
     lost: list[str] = []
     with (

@@ -15,12 +15,12 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine.pipeline import open_dataset
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
-from tacpipe.live import publishing, wire
+from tacpipe.live import publishing
 from tacpipe.live.settings import LiveTask, SessionOptions, Settings, SettingValues, parse_option
 from tacpipe.plugins import fields, registry
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
-from tacpipe.recording import recorder
+from tacpipe.recording import recorder, scheduling
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, RigStream
 from tacpipe.sensors.sensor import Options
@@ -65,7 +65,7 @@ def prepare(rig: Rig, rig_file: str, options: SettingValues) -> PreparedSession:
     settings = Settings.from_sources(model.live.settings, rig.live, rig_file, parsed)
     if settings.realtime:
         with settings.naming("realtime"):
-            wire.check_realtime()
+            scheduling.check_realtime()
     with settings.naming("publish"):
         for address in settings.publish:
             publishing.parse_publish_address(address)

@@ -28,6 +28,7 @@ from tacpipe.live.publishing import Publishers
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
 from tacpipe.recording import rig as rigs
+from tacpipe.recording import scheduling
 from tacpipe.recording.spool import StreamNote
 
 REPORT_NS = 250_000_000  # period of reports to the recording process
@@ -214,7 +215,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     os.nice(options.nice)
     sys.setswitchinterval(SWITCH_S)
     if options.settings.realtime:
-        wire.realtime(wire.MODEL)
+        scheduling.realtime(scheduling.MODEL)
     send_line(connection, {"ready": True})
     from tacpipe.models.tensors import one_thread  # imports torch, which the engine has already loaded
 

@@ -134,14 +134,10 @@ class Supervisor:
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self._beginning = None
         self.tap.note(StreamNote(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
-        if self.options.settings.realtime:
-            wire.realtime(wire.RECORDER)
 
     def end(self) -> None:
         """End the recording; data until the next one are not predicted."""
         self._offset_ns = None
-        if self.options.settings.realtime:
-            wire.ordinary()  # this thread decodes and writes, which has no deadline
         self.tap.note(StreamNote(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[StreamNote]:

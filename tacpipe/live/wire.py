@@ -1,27 +1,22 @@
-"""Connect the recording process with the model's process, and schedule their threads in real time.
+"""Connect the recording process with the model's process.
 
 The threads that read the links call `RecorderTap.put`, which never waits and never raises. Blocks that the socket does
 not accept immediately wait in a bounded queue. When it is full, the whole queue is dropped and counted, and the model's
 process is notified. The recording loses nothing.
 
-Blocks are sent one way, in the format of a spool; JSON lines are sent back. The threads of both processes run before
-all ordinary programs, the recorder's before the model's. ``nice`` is no substitute: if the kernel groups processes by
-session (``sched_autogroup_enabled``, as on most desktops), it only affects programs of one terminal.
+Blocks are sent one way, in the format of a spool; JSON lines are sent back.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import socket
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TypedDict
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
 from tacpipe.recording import clock, spool
 from tacpipe.recording.spool import CHUNKS, HEAD, MARK, NOTE, WHOLE, StreamNote
@@ -212,40 +207,3 @@ class RecorderTap:
                 self._waiting.popleft()
             else:
                 self._waiting[0] = self._waiting[0][sent:]
-
-
-RECORDER, MODEL = 20, 10  # priorities, so that the recording never waits for the model
-
-
-def check_realtime() -> None:
-    """Raise `UsageError` if the system does not allow real-time scheduling."""
-    try:
-        _set(0, RECORDER)
-    except (OSError, AttributeError) as error:
-        raise UsageError(
-            f"--realtime: real-time scheduling is not allowed here ({error}). Run the session as root, or have "
-            f"`@realtime - rtprio {RECORDER}` in /etc/security/limits.d and this user in that group; or leave it out."
-        ) from error
-    ordinary()
-
-
-def realtime(priority: int) -> None:
-    """Run all threads of this process before ordinary programs, if permitted."""
-    for thread in _threads():
-        with contextlib.suppress(OSError):  # the thread may have ended
-            _set(thread, priority)
-
-
-def ordinary() -> None:
-    """Schedule all threads of this process normally again."""
-    for thread in _threads():
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
-
-
-def _set(thread: int, priority: int) -> None:
-    os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority))
-
-
-def _threads() -> list[int]:
-    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()]

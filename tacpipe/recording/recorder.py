@@ -13,7 +13,7 @@ from typing import Protocol
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import opening
-from tacpipe.recording import clock
+from tacpipe.recording import clock, scheduling
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import spool as spool_of
 from tacpipe.recording.pace import STALL_NS
@@ -53,8 +53,10 @@ class Companion(Protocol):
 class Recorder:
     """An open rig. `tick` moves bytes from the links to the watches and the spool, and must be called every `TICK_S`."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, *, realtime: bool = False) -> None:
+        """Prepare the streams of a rig; if ``realtime``, recordings run before ordinary programs."""
         self.rig = rig
+        self._realtime = realtime
         self.stations = {name: Station(stream) for name, stream in rig.streams.items()}
         self.watches = {name: Watch(stream) for name, stream in rig.streams.items()}
         self._spool: Spool | None = None
@@ -136,8 +138,13 @@ class Recorder:
         """Start the companion without a recording. Nothing is spooled."""
         if self._companion is not None:
             self._companion.begin(spool_of.read_clocks())
+        self._prioritize()
         for name, station in self.stations.items():
             self._watch(name, station.start_recording(lambda chunks, size, last_ns: None, None))
+
+    def _prioritize(self) -> None:
+        if self._realtime:
+            scheduling.realtime(scheduling.RECORDER)
 
     @contextlib.contextmanager
     def recording(self, spool: Spool, *, preroll: bool = False) -> Iterator[None]:
@@ -150,6 +157,7 @@ class Recorder:
         preroll_start_ns = clock.now_ns() - round(PREROLL_S * 1e9)
         if self._companion is not None:
             self._companion.begin(spool.clock)
+        self._prioritize()
         for name, station in self.stations.items():
             self._watch(name, station.take())
             preroll_blocks = _retained_blocks(self._preroll[name], preroll_start_ns) if preroll else None
@@ -165,6 +173,8 @@ class Recorder:
             yield
         finally:
             self._spool = None
+            if self._realtime:
+                scheduling.ordinary()  # decoding and writing have no deadline
             if self._companion is not None:
                 self._companion.end()
             self._note_tick()

@@ -304,7 +304,7 @@ STAGES = (
         (
             *FORWARD[:4],
             "train classify data/c --split data/split -o models/n --label contact --architecture linear "
-            "--recentre contact",
+            "--recentre sensor",
         ),
     ),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),

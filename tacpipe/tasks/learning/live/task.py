@@ -143,7 +143,7 @@ def check_causal(chain: Sequence[Step], config: Mapping[str, Any], *, allow_look
     if params.get("recentre") and "level_from" not in config:
         raise TacpipeError(
             f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Run "
-            f"`tacpipe recentre MODEL RECORDINGS -o ADAPTED` on recordings of the session, and give the model that it writes."
+            f"`tacpipe recentre MODEL RECORDINGS -o ADAPTED` on recordings of the session, and give the new model."
         )
     synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
     if synchronize is not None and synchronize.values == "interpolate" and not allow_look_ahead:
