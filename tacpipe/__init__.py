@@ -78,11 +78,13 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("tacpipe")
-    raise AttributeError(f"module 'tacpipe' has no attribute {name!r}")
+    from tacpipe.datasets import guesses
+
+    raise guesses.missing("The module tacpipe", name, guesses.MODULE)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return __all__
 
 
 def open(path: str | PathLike[str]) -> Dataset:
@@ -91,7 +93,7 @@ def open(path: str | PathLike[str]) -> Dataset:
     Data are read and verified when they are needed:
 
         dataset = tacpipe.open("data/synced")
-        frame = dataset["trial-003"].table().to_pandas()
+        frame = dataset["trial-003"].to_pandas()
 
     :raises UsageError: if there is no dataset.
     :raises DamagedError: if the manifest was changed.
@@ -157,7 +159,7 @@ def run(
 
     named_inputs = {"model": model, "split": split, "codec": codec, "init": init, "extend": extend}
     return calling.call(
-        name,
+        name.replace(" ", "."),
         datasets,
         output,
         {key: source for key, source in named_inputs.items() if source is not None},

@@ -119,7 +119,7 @@ def command(name: str, options: dict[str, Any]) -> str:
     """Return a command line whose inputs do not exist, which would be found out next."""
     words = [f"--{key.replace('_', '-')}={value}" for key, value in options.items()]
     split = "--split nowhere" if registry.load(name).needs_split else ""
-    inputs = {"simulate": "", **dict.fromkeys(("calibrate", "evaluate", "predict"), "nowhere nowhere")}
+    inputs = {"simulate": "", **dict.fromkeys(("calibrate", "evaluate", "predict", "recentre"), "nowhere nowhere")}
     return f"{name.replace('.', ' ')} {inputs.get(name.partition('.')[0], 'nowhere')} {split} -o out {' '.join(words)}"
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from tacpipe.cli import guesses
 from tacpipe.io.files import local
 
 REQUIRED, PARAMS, RUN, OUTPUT, OPTIONS = "Required", "Params", "Run", "Output", "Options"
@@ -145,6 +146,14 @@ class BriefCommand(PanelCommand):
 class HelpGroup(TyperGroup):
     """Group of commands whose help shows each command's complete summary."""
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return name, command and further words. The error for an unknown command states what may be meant."""
+        try:
+            return super().resolve_command(ctx, args)
+        except misuse() as error:
+            error.message = guesses.explain(ctx.command_path, args[0], self.list_commands(ctx), error.message)
+            raise
+
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         """Write the description, one paragraph after another."""
         formatter.write_paragraph()
@@ -164,6 +173,11 @@ class HelpGroup(TyperGroup):
         for title, names in (_sections(rows) if ctx.parent is None else {"Commands": tuple(rows)}).items():
             with formatter.section(title):
                 formatter.write_dl([(name.ljust(width), rows[name]) for name in names])
+
+
+def misuse() -> type[Any]:
+    """Return the exception type that click raises for a malformed command line; typer may bundle its own click."""
+    return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 def unrequested() -> None:

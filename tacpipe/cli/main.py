@@ -12,7 +12,6 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import typer
 
@@ -181,17 +180,12 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
             code = typer.main.get_command(program).main(words, prog_name="tacpipe", standalone_mode=False)
     except typer.Abort:
         return FAILED, ""
-    except _misuse() as error:
+    except help.misuse() as error:
         text = io.StringIO()
         error.show(text)
         terminal.note(text.getvalue().rstrip("\n"))
         return error.exit_code, error.format_message()
     return code if isinstance(code, int) else DONE, ""
-
-
-def _misuse() -> type[Any]:
-    """Return the exception type that click raises for a malformed command line; typer may bundle its own click."""
-    return next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
 def _add_summaries(program: typer.Typer) -> None:

@@ -216,7 +216,10 @@ def _as(value: Attribute, kind: pa.DataType) -> Any:
 
 
 def to_pandas(table: pa.Table) -> pd.DataFrame:
-    """Return an arrow table as a frame. Integers with nulls become pandas' nullable integers."""
+    """Return an arrow table as a frame, with the units of the columns in ``attrs["units"]``.
+
+    Integers with nulls become pandas' nullable integers.
+    """
     import pandas as pd
     import pyarrow as pa
 
@@ -225,6 +228,8 @@ def to_pandas(table: pa.Table) -> pd.DataFrame:
         if pa.types.is_integer(field.type) and column.null_count:
             nullable = pd.api.types.pandas_dtype(str(field.type).replace("u", "U").replace("i", "I"))
             frame[field.name] = column.to_pandas(types_mapper={field.type: nullable}.get)
+    units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in table.schema}
+    frame.attrs["units"] = {name: unit for name, unit in units.items() if unit}
     return frame
 
 

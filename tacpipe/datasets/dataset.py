@@ -8,10 +8,10 @@ import operator
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 from weakref import WeakValueDictionary
 
-from tacpipe.datasets import pages, selection
+from tacpipe.datasets import guesses, pages, selection
 from tacpipe.datasets.manifest import Manifest, ManifestJson
 from tacpipe.datasets.paths import shard_path
 from tacpipe.datasets.selection import Wanted
@@ -63,6 +63,16 @@ class Recording:
         from tacpipe.datasets import overview
 
         return overview.recording_html(self)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            streams = dict.fromkeys(self.__dict__.get("_shards", ()), f"recording[{name!r}] is the stream")
+            raise guesses.missing("A recording", name, {**guesses.RECORDING, **streams})
+
+    def __getitem__(self, stream: str) -> pd.DataFrame:
+        """Return a stream as `to_pandas` does."""
+        return self.to_pandas(stream)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._dataset is None:
@@ -132,6 +142,12 @@ class Recording:
             names = {name: names[name] for name in columns}
         return stored.read(list(names.values())).rename_columns(list(names))
 
+    def to_pandas(self, stream: str = "", columns: Sequence[str] | None = None) -> pd.DataFrame:
+        """Return a stream as a frame, with the columns' units in ``attrs["units"]``. Arguments are those of `table`."""
+        from tacpipe.datasets import arrays
+
+        return arrays.to_pandas(self.table(stream, columns))
+
     def columns(self, stream: str = "") -> Columns:
         """Return a stream whose columns are decoded on demand, after verifying its bytes.
 
@@ -191,8 +207,9 @@ class Dataset:
     """A dataset opened for reading: recordings by name, files by name.
 
     ``len(dataset)`` is the number of recordings, iteration yields them in the order of their names,
-    ``dataset["trial-003"]`` returns one, and ``"trial-003" in dataset`` tests for its name. A dataset without
-    recordings, such as a model, is true. Datasets can be pickled; the copy reads from the same location.
+    ``dataset["trial-003"]`` and ``dataset[3]`` return one, ``dataset[:3]`` a dataset of three, and ``"trial-003" in
+    dataset`` tests for its name. A dataset without recordings, such as a model, is true. Datasets can be pickled; the
+    copy reads from the same location.
     """
 
     def __init__(
@@ -222,8 +239,25 @@ class Dataset:
     def __iter__(self) -> Iterator[Recording]:
         return iter(self.recordings.values())
 
-    def __getitem__(self, name: str) -> Recording:
-        """Return the recording with this name. Raises `UsageError` if there is none."""
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            raise guesses.missing("A dataset", name, guesses.DATASET)
+
+    @overload
+    def __getitem__(self, name: str | int) -> Recording: ...
+
+    @overload
+    def __getitem__(self, name: slice) -> Dataset: ...
+
+    def __getitem__(self, name: str | int | slice) -> Recording | Dataset:
+        """Return the recording with this name or place, or the dataset of a slice. Raises `UsageError` if there is none."""
+        if isinstance(name, slice):
+            return self.only(self.names[name])
+        if isinstance(name, int):
+            if not -len(self) <= name < len(self):
+                raise IndexError(f"There is no recording {name} in {self._location}; it has {len(self)}.")
+            name = self.names[name]
         if name not in self.recordings:
             raise UsageError(
                 f"There is no recording {name!r} in {self._location}; it has {listed(self.recordings, _NAMED)}."
@@ -254,6 +288,24 @@ class Dataset:
     @property
     def _location(self) -> str:
         return "this dataset" if self.path is None else str(self.path)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the recordings."""
+        return list(self.recordings)
+
+    @property
+    def streams(self) -> dict[str, list[str]]:
+        """The columns of each stream of the first recording; a single table is the stream ""."""
+        first = next(iter(self), None)
+        return {} if first is None else {stream: first.columns(stream).column_names for stream in first.streams}
+
+    @property
+    def metrics(self) -> Any:
+        """The measures of a result of `evaluate`, as JSON. Raises `UsageError` for other datasets."""
+        if "metrics.json" not in self.files:
+            raise UsageError(f"{self._location} is not a result; `tacpipe evaluate` writes one.")
+        return json.loads(self.files["metrics.json"])
 
     @property
     def labels(self) -> pd.DataFrame:
@@ -352,8 +404,8 @@ class Dataset:
     ) -> pd.DataFrame:
         """Return all recordings in one frame after a categorical column ``recording``. Arguments are those of `table`.
 
-        Integers with nulls, for example because only some recordings have the column, become pandas' nullable integers:
-        a column of floats would round values beyond 2^53.
+        ``attrs["units"]`` has the unit of each column. Integers with nulls, for example because only some recordings have
+        the column, become pandas' nullable integers: a column of floats would round values beyond 2^53.
         """
         from tacpipe.datasets import arrays
 

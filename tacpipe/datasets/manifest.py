@@ -404,8 +404,9 @@ def find(path: Path | str) -> Found:
         raise UsageError(f"{error} There is no dataset.") from None
     except (FileNotFoundError, NotADirectoryError):
         problem = "does not exist or is empty" if not location.exists() else f"has no {NAME}"
+        inside = next((f", such as {each.parent}" for each in sorted(location.glob(f"*/{NAME}"))), "")
         raise UsageError(
-            f"{location} {problem}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
+            f"{location} {problem}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o{inside}."
         ) from None
     except OSError as error:
         raise read_error(file, error) from error

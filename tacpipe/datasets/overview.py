@@ -66,7 +66,8 @@ def stored_columns(schema: pa.Schema) -> dict[str, dict[str, str]]:
         is_signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
         if is_signal:
             stream = metadata.get(b"stream", b"").decode()
-            columns.setdefault(stream, {"t_ns": "t_ns"})[_recorded_name(field.name, stream)] = field.name
+            times = {"t_ns": "t_ns"} if "t_ns" in schema.names else {}
+            columns.setdefault(stream, times)[_recorded_name(field.name, stream)] = field.name
     return columns
 
 
@@ -94,6 +95,10 @@ def lines(dataset: ReadableDataset) -> list[tuple[str, str]]:
         rows.append(("streams", _streams(dataset[names[0]])))
         labels = _labels(dataset)
         rows += [("labels", labels)] if labels else []
+    if "metrics.json" in manifest.files:
+        rows.append(("measures", "dataset.metrics; `tacpipe show` prints the table"))
+    elif "config.json" in manifest.files and not names:
+        rows.append(("a model", "tacpipe.load(PATH) returns it, `tacpipe show` prints its table"))
     if manifest.files:
         rows.append(("files", listed(sorted(manifest.files), _NAMED)))
     return [(title, printable.lines([text])) for title, text in rows]
@@ -151,7 +156,7 @@ def _streams(recording: ReadableRecording) -> str:
 
 
 def _size(table: pa.Table) -> str:
-    rate_hz = streams.rate_hz(table)
+    rate_hz = streams.rate_hz(table) if "t_ns" in table.column_names else 0
     return f"{f'{rate_hz:g} Hz, ' if rate_hz else ''}{counted(table.num_columns, 'column')}"
 
 

@@ -151,6 +151,10 @@ class InputRows:
         """Seconds since the first sample (time,)."""
         return np.asarray((self.t_ns - self.start_ns) / 1e9)
 
+    def stored_stream(self, stream: str) -> str:
+        """Return the name under which a stream is stored: "" for a stream in a table of all streams."""
+        return stream if self.recording is None or stream in self.recording.streams else ""
+
     def windows(self, rows: Indices, stream: int, length: int) -> AnyFloats:
         """Return the windows (window, time, channel) of a stream that end in these rows."""
         ends = self.newest[rows, stream]
@@ -188,8 +192,7 @@ class Inputs:
             starts = rows.newest[used_rows, index] + 1 - stream.rows
             used = rows_in_windows(starts, stream.rows, len(samples.t_ns))
             used[: samples.begin if len(used_rows) else 0] = True
-            name = stream.stream if rows.recording is None or stream.stream in rows.recording.streams else ""
-            count_rows(rows.name, name, RowCounts.from_masks(used, [], otherwise))
+            count_rows(rows.name, rows.stored_stream(stream.stream), RowCounts.from_masks(used, [], otherwise))
 
     def table(self, recording: Recording, stream: InputStream) -> pa.Table:
         """Return the columns of a stream in a recording. Raises `TacpipeError` if a stream or column is missing."""

@@ -186,7 +186,8 @@ def recentre(files: Mapping[str, bytes], recordings: Dataset) -> Result:
     ]
     for each in rows:
         for stream, samples in zip(read.streams, each.streams, strict=True):
-            count_rows(each.name, stream.stream, RowCounts.from_masks(np.ones(len(samples.t_ns), bool), [], NO_WINDOW))
+            counts = RowCounts.from_masks(np.ones(len(samples.t_ns), bool), [], NO_WINDOW)
+            count_rows(each.name, each.stored_stream(stream.stream), counts)
     config = {**model.config, "inputs": streams, "level_from": [recording.name for recording in opened]}
     count = sum(len(each.streams[0].values) for each in rows)
     note = f"The level is the median of {count:,} rows of {listed([recording.name for recording in opened], 3)}."
