@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import re
 import zoneinfo
+from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -373,4 +374,9 @@ def _refuse_flagged(bad: Any, column: pa.Array, expected: str) -> None:
     flags = bad.to_numpy(zero_copy_only=False)
     if flags.any():
         row = int(flags.argmax())
-        raise StampError(row, str(column[row].as_py()), expected)
+        value: Any = column[row].as_py()
+        text = f"{value.normalize():f}" if isinstance(value, Decimal) else str(value)
+        size = float(value) if isinstance(value, int | float | Decimal) else 0.0
+        unit = unit_of_unix_time(size) if size < 2**63 and expected == IN_RANGE else None
+        hint = f'; it looks like Unix time in {unit}, so write unit = "{unit}" in the layout' if unit else ""
+        raise StampError(row, text, f"{expected}{hint}")

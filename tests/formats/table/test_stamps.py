@@ -90,6 +90,17 @@ def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUn
     assert result.value.row == row
 
 
+@pytest.mark.parametrize(("text", "unit"), [("1744849152016", "ms"), ("1744849152016136.5", "us"), ("1e25", None)])
+def test_a_unix_time_in_a_smaller_unit_is_told_with_that_unit(tmp_path: Path, text: str, unit: TimeUnit | None) -> None:
+    path = tmp_path / "skin.csv"
+    path.write_text(f"time,a\n{text},2\n")
+    stream = StreamLayout("skin", time=Time(column="time", unit="s"), columns=(ColumnRule(match="a"),))
+    with pytest.raises(TacpipeError) as raised:
+        labs.read_stream_table(path, stream)
+    assert (f'write unit = "{unit}"' in str(raised.value)) == (unit is not None)
+    assert unit is None or f"holds '{text}';" in str(raised.value)
+
+
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 @pytest.mark.parametrize("text", ["1e25", "-1e25"])
 def test_a_stamp_beyond_every_range_is_refused_and_names_its_row(tmp_path: Path, text: str, unit: TimeUnit) -> None:
