@@ -249,7 +249,15 @@ class TextTable(RowFile):
                     continue
                 if comment and text.lstrip(" \t").startswith(comment):
                     continue
-                yield number, next(csv.reader([text], delimiter=separator))
+                try:
+                    yield number, next(csv.reader([text], delimiter=separator))
+                except csv.Error as error:
+                    if "\r" not in text:
+                        raise
+                    raise TacpipeError(
+                        f"{self.path}, line {number}: lines end with a carriage return alone. Convert the file: "
+                        f"`tr '\\r' '\\n' < {self.path.name} > NEW`."
+                    ) from error
 
     def describe_cut(self) -> list[str]:
         """Return a note if the file ends within a line whose last cell is shorter than the others of its column."""

@@ -169,6 +169,7 @@ WRONG = {  # content of a file, and what the sentence about it must name
     "time,taxel1\n0,1\n": ("fx", "[streams.skin]"),
     "stamp,taxel1,fx\n0,1,1\n": ("time", "stamp"),
     'time,taxel1,fx\n0,"1,1\n': ("line 2",),
+    "time,taxel1,fx\r0,1,1\r": ("line 1", "carriage return alone", r"tr '\r' '\n'"),
 }
 
 
