@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,16 @@ def commanded(lab: Lab, command: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def await_from(process: subprocess.Popen[str], condition: Callable[[], Any]) -> None:
+    """Wait until a condition holds while a session runs. If it ends before, fail with what it printed."""
+
+    def holds() -> bool:
+        assert process.poll() is None, process.communicate()
+        return bool(condition())
+
+    live.awaited(holds)
 
 
 def model_process(session: subprocess.Popen[str]) -> int:

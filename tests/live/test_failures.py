@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.live.preparation import free_ports
 from tacpipe.live.session import DIED, RESTARTED
 from tests.conftest import Lab
 from tests.emulation.byte_faults import Faults
 from tests.live.persistent import GAP_NS, PERIOD_NS
-from tests.live.sessions import ended, forecasts, model_process, started, subscriber, whole
+from tests.live.sessions import await_from, ended, forecasts, model_process, started, subscriber, whole
 from tests.live.test_publishers import HANDSHAKE
 from tests.recording import live, patient
 
@@ -44,9 +43,9 @@ def test_a_stream_that_stalls_costs_the_forecasts_of_that_time(lab: Lab) -> None
     faults = Faults(stall=0.7, stall_s=0.6)
     with live.served(lab.folder, SKIN, live.WRENCH, faults=faults), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: without(messages, "skin"))
+        await_from(process, lambda: without(messages, "skin"))
         count = messages.index(without(messages, "skin")[0])
-        live.awaited(lambda: len(forecasts(messages[count:])) > 20)
+        await_from(process, lambda: len(forecasts(messages[count:])) > 20)
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     arrivals = shard.table("skin").column("t_ns").to_numpy()
@@ -61,7 +60,7 @@ def test_a_device_whose_clock_is_set_anew_changes_no_forecast(lab: Lab) -> None:
     faults = Faults(clock_step=1.0, clock_step_ms=5000.0)
     with live.served(lab.folder, SKIN, faults=faults), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: len(forecasts(messages)) > 150)
+        await_from(process, lambda: len(forecasts(messages)) > 150)
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     steps_ns = np.diff(shard.table("skin").column("t_device_ns").to_numpy())
@@ -77,11 +76,11 @@ def test_a_device_whose_clock_is_set_anew_changes_no_forecast(lab: Lab) -> None:
 def test_a_model_process_that_is_killed_is_replaced_by_one_that_continues_its_grid(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: len(forecasts(messages)) > 30)
+        await_from(process, lambda: len(forecasts(messages)) > 30)
         os.kill(model_process(process), signal.SIGKILL)
         count = len(messages)
-        live.awaited(lambda: any(message["kind"] == "description" for message in messages[count:]))
-        live.awaited(lambda: len(forecasts(messages[count:])) > 30)
+        await_from(process, lambda: any(message["kind"] == "description" for message in messages[count:]))
+        await_from(process, lambda: len(forecasts(messages[count:])) > 30)
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     assert printed["live"]["restarts"] == 1
@@ -94,11 +93,12 @@ def test_a_model_process_that_is_killed_is_replaced_by_one_that_continues_its_gr
 def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab) -> None:
     from websockets.sync.client import connect
 
-    (place,) = free_ports(1)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        place = free.getsockname()[1]
     received: list[dict[str, Any]] = []
     with live.served(lab.folder, SKIN), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish ws:127.0.0.1:{place} --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: bool(forecasts(messages)))
+        await_from(process, lambda: bool(forecasts(messages)))
         with socket.socket() as slow, connect(f"ws://127.0.0.1:{place}/?max_age_ms=600000", max_size=None) as quick:
             slow.connect(("127.0.0.1", place))
             slow.sendall(HANDSHAKE)
@@ -109,7 +109,7 @@ def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab
 
             listening = threading.Thread(target=listen, daemon=True)
             listening.start()
-            live.awaited(lambda: len(received) == 200)
+            await_from(process, lambda: len(received) == 200)
             ended(process, interrupt=True)
             listening.join()
     assert received[0]["kind"] == "description"

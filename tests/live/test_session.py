@@ -13,7 +13,7 @@ from tacpipe.live.session import DIED, RESTARTED
 from tacpipe.sensors import plan as plans
 from tests.conftest import Lab, without_created_store
 from tests.live.persistent import CHANNELS, HORIZON
-from tests.live.sessions import ended, forecasts, started, subscriber, whole
+from tests.live.sessions import await_from, ended, forecasts, started, subscriber, whole
 from tests.recording import live, patient
 
 pytestmark = pytest.mark.rig
@@ -60,7 +60,9 @@ def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_re
 def test_a_model_process_that_dies_is_started_anew_and_no_sample_is_lost(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}", "die:40")
-        live.awaited(lambda: len({message["seq"] for message in forecasts(messages)}) < len(forecasts(messages)) - 5)
+        await_from(
+            process, lambda: len({message["seq"] for message in forecasts(messages)}) < len(forecasts(messages)) - 5
+        )
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     causes = [cause for cause, _ in live.events(shard, "forecast")]
@@ -79,12 +81,12 @@ def test_a_model_that_is_too_slow_costs_forecasts_which_are_counted_and_no_sampl
 def test_a_stream_that_goes_away_costs_the_forecasts_until_it_is_back(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH) as rig, subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: len(forecasts(messages)) > 20)
+        await_from(process, lambda: len(forecasts(messages)) > 20)
         rig.unplug("skin")
-        live.awaited(lambda: "skin" in messages[-1].get("cause", "") and messages[-1]["values"] is None)
+        await_from(process, lambda: "skin" in messages[-1].get("cause", "") and messages[-1]["values"] is None)
         rig.replug("skin")
         count = len(messages)
-        live.awaited(lambda: len(forecasts(messages[count:])) > 20)
+        await_from(process, lambda: len(forecasts(messages[count:])) > 20)
         ended(process, interrupt=True)
     shard = live.only(lab.folder)
     assert whole(shard, "wrench") and "lost" in [cause for cause, _ in live.events(shard, "skin")]
@@ -107,7 +109,7 @@ def test_packets_that_are_no_plan_or_of_another_sender_are_counted_and_not_kept(
         process = started(
             lab, f"-o rec --json --plan udp::{place} --plan-from 127.0.0.2 --publish udp:127.0.0.1:{port}"
         )
-        live.awaited(lambda: len(forecasts(messages)) > 5)
+        await_from(process, lambda: len(forecasts(messages)) > 5)
         allowed, foreign = (opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
         allowed.bind(("127.0.0.2", 0))
         for _ in range(10):
@@ -130,7 +132,7 @@ def test_packets_that_are_no_plan_or_of_another_sender_are_counted_and_not_kept(
 def test_without_an_output_nothing_is_kept_and_figures_are_printed(lab: Lab) -> None:
     with live.served(lab.folder, SKIN), subscriber() as (port, messages):
         process = started(lab, f"--json --publish udp:127.0.0.1:{port}")
-        live.awaited(lambda: len(forecasts(messages)) > 20)
+        await_from(process, lambda: len(forecasts(messages)) > 20)
         printed = ended(process, interrupt=True)
     assert printed["live"]["forecasts"] > 20 and printed["recordings"] == [] and printed["output"] is None
     assert not (lab.folder / "rec").exists()
