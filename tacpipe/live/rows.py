@@ -1,6 +1,6 @@
 """The engine of models that answer rows: it decodes samples as they arrive and answers each row that is due.
 
-A task adds its rows (`Rows`), the message for a row, and the message without an answer. Decoding, levels at rest, late
+A task adds its rows (`RowSource`), the message for a row, and the message without an answer. Decoding, levels at rest, late
 samples, overload, restarts and silence are handled here for all of them.
 """
 
@@ -48,7 +48,7 @@ RESTARTED = "the model's process was started anew"
 OVERLOADED = "blocks were dropped under overload"
 
 
-class Rows(Protocol):
+class RowSource(Protocol):
     """The rows of a recording, which are computed as its samples arrive."""
 
     @property
@@ -74,7 +74,7 @@ class Rows(Protocol):
         """Take what earlier rows of the session know beside their beginning, such as plans."""
 
 
-R = TypeVar("R", bound=Rows)
+R = TypeVar("R", bound=RowSource)
 
 
 class RowEngine(Engine, Generic[R]):

@@ -39,7 +39,7 @@ class SlideRow(NamedTuple):
     is_final: bool
 
 
-class Slides:
+class SlidesSoFar:
     """The slides of a recording so far, each with a row whenever it is asked for and a final one."""
 
     def __init__(
@@ -72,7 +72,7 @@ class Slides:
         stored = [self._tables[stream]] if stream in self._tables else []
         self._tables[stream] = pa.concat_tables([*stored, table]).combine_chunks()
 
-    def take_over(self, previous: Slides) -> None:
+    def take_over(self, previous: SlidesSoFar) -> None:
         """Take nothing: the samples of earlier rows have a gap."""
 
     def until(self, until_ns: int | None) -> list[SlideRow]:
@@ -126,7 +126,7 @@ class Slides:
         return self._slide.answer(streams)
 
 
-class MaterialEngine(RowEngine[Slides]):
+class MaterialEngine(RowEngine[SlidesSoFar]):
     """A live session with a material model."""
 
     most_rows: ClassVar[int] = 1 << 30  # each slide has its final answer
@@ -144,7 +144,9 @@ class MaterialEngine(RowEngine[Slides]):
     ) -> None:
         """Store the sensors and settings. If ``pause_ns`` is 0, a recording is one slide."""
         super().__init__(
-            sensors, lambda beginning: Slides(slide, tuple(sensors), finger, pause_ns, beginning), settle_ns=settle_ns
+            sensors,
+            lambda beginning: SlidesSoFar(slide, tuple(sensors), finger, pause_ns, beginning),
+            settle_ns=settle_ns,
         )
         self.every_ns = every_ns
         self._description = description
