@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 ENCODED_FRAMES = 32  # frames per batch of the encoder
 HELD_OUT = 0.15  # fraction of the training recordings used for early stopping
+MIN_RATIO = 0.5  # minimum fraction of the markers that are found in a reliable frame
+MAX_UNRELIABLE = 0.1  # maximum fraction of other frames without a note
 MAX_CELLS = 10_000  # maximum number of grid cells, each with three columns
 
 
@@ -89,6 +91,9 @@ class MarkerParams(StreamSelection):
     columns: PositiveInt = 6  # columns of the grid
     # distance between neighbouring markers on the gel, for displacements in millimetres; 0: pixels
     pitch_mm: Annotated[NonNegativeFloat, Unit("mm")] = 0.0
+    # number of first frames that show the untouched gel; the first with all markers is used, else the one with the most
+    reference_frames: PositiveInt = 5
+    polarity: Literal["auto", "dark", "light"] = "auto"  # brightness of the markers; auto: the one with more markers
 
     def check(self) -> None:
         """Raise `UsageError` for a grid with more markers than a table should have columns."""
@@ -98,22 +103,24 @@ class MarkerParams(StreamSelection):
             )
 
 
-@stage(version=2)
+@stage(version=3)
 def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
     """Track the markers of a gel as tactile channels.
 
     Each stream of frames becomes a stream with one row per frame: the displacement of each marker along x and y since
-    the first frame, and the fraction of detected markers. The first frame shows the untouched gel, so start a recording
-    before contact. A marker that is not visible is null. No row looks ahead. A marker that moves by more than half the
-    distance to its neighbours between two frames may be mistaken for one of them. Streams without frames stay
-    unchanged.
+    the first frames, and the fraction of markers that are found. The first frames show the untouched gel, so start a
+    recording before contact. A marker that is hidden, or that contradicts the order of the grid, is null. No row looks
+    ahead. If all markers move by more than half the distance to their neighbours between two frames, they may be
+    mistaken for these. Streams without frames stay unchanged.
 
     Example: tacpipe extract markers data/gels -o data/markers
     """
     from tacpipe.video.channels import MarkerChannels
 
     def compute(subject: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
-        channels = MarkerChannels(params.rows, params.columns, params.pitch_mm, subject)
+        channels = MarkerChannels(
+            params.rows, params.columns, params.pitch_mm, params.reference_frames, params.polarity, subject
+        )
         return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
 
     return _replace_frames(recording, compute)
@@ -261,12 +268,17 @@ def _count_frames(
     """
     import pyarrow as pa
 
+    from tacpipe.video.channels import DETECTED_RATIO
     from tacpipe.video.stream import describe_damage
 
     def batches() -> Iterator[pa.RecordBatch]:
         damaged = [np.zeros(0, bool)]  # (frame,) by batch
+        unreliable = 0
         for batch in values:
             damaged.append(batch.column(batch.num_columns - 1).is_null().to_numpy(zero_copy_only=False))
+            if DETECTED_RATIO in batch.schema.names:
+                ratio = batch.column(DETECTED_RATIO).to_numpy(zero_copy_only=False)
+                unreliable += int(np.count_nonzero(ratio < MIN_RATIO))
             yield batch
         is_damaged = np.concatenate(damaged)
         without_image = columns.num_rows - len(is_damaged)
@@ -274,6 +286,10 @@ def _count_frames(
         rows[stream] = RowCounts(columns.num_rows, columns.num_rows - sum(unused.values()), unused)
         if is_damaged.any():
             notes.append(f"Stream {stream}: {describe_damage(is_damaged)}. Their rows are null.")
+        if unreliable > MAX_UNRELIABLE * len(is_damaged):
+            notes.append(
+                f"Stream {stream}: fewer than half of the markers are found in {unreliable:,} of {len(is_damaged):,} frames."
+            )
 
     return pa.RecordBatchReader.from_batches(values.schema, batches())
 

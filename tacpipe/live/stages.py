@@ -29,7 +29,9 @@ CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.difference": lambda params, place: DifferenceChannels(
         params.rows, params.columns, params.reference_frames, place
     ),
-    "extract.markers": lambda params, place: MarkerChannels(params.rows, params.columns, params.pitch_mm, place),
+    "extract.markers": lambda params, place: MarkerChannels(
+        params.rows, params.columns, params.pitch_mm, params.reference_frames, params.polarity, place
+    ),
 }  # channels by stage, of its params and the name of the stream
 
 

@@ -15,10 +15,12 @@ from tacpipe.arrays import AnyFloats, Bytes, Float32s
 from tacpipe.errors import TacpipeError
 from tacpipe.video.decoding import GREY, FrameDecoder, cell_means, has_lost_block, padded_packet
 from tacpipe.video.encoding import RGB
-from tacpipe.video.markers import MarkerTracker, find_grid, use_one_thread
+from tacpipe.video.lattice import MIN_DOTS
+from tacpipe.video.markers import GridSearch, MarkerTracker, Polarity, use_one_thread
 from tacpipe.video.stream import PACKET, VideoFormat
 
 COLOURS = ("red", "green", "blue")
+DETECTED_RATIO = "detected_ratio"  # column with the fraction of markers that are found
 CLOCKS = ("t_ns", "t_device_ns", "seq")  # columns that a stream of channels has from its stream of frames
 
 
@@ -84,17 +86,21 @@ class DifferenceChannels:
 
 
 class MarkerChannels:
-    """The displacement of each marker since the first frame, and the fraction of detected markers.
+    """The displacement of each marker since the first frames, and the fraction of markers that are found.
 
-    ``place`` names the stream in errors. Raises `TacpipeError` if the first frame shows no grid of markers.
+    The grid is found in the first ``reference_frames`` frames, as `GridSearch` describes. ``place`` names the stream in
+    errors.
     """
 
     grey = True
 
-    def __init__(self, rows: int, columns: int, pitch_mm: float, place: str) -> None:
+    def __init__(
+        self, rows: int, columns: int, pitch_mm: float, reference_frames: int, polarity: Polarity, place: str
+    ) -> None:
         self._rows, self._columns, self._pitch_mm, self._place = rows, columns, pitch_mm, place
+        self._search = GridSearch(rows, columns, polarity, reference_frames)
         self._tracker: MarkerTracker | None = None
-        self._scale = 1.0
+        use_one_thread()  # a stage uses one core per recording
 
     def fields(self) -> list[pa.Field]:
         """Return the fields ``taxel0101_x``, ``taxel0101_y`` …, float32 px or mm, and ``detected_ratio``."""
@@ -107,37 +113,55 @@ class MarkerChannels:
             )
             for row, column, axis in product(range(1, self._rows + 1), range(1, self._columns + 1), ("x", "y"))
         ]
-        quality = pa.field("detected_ratio", pa.float32(), metadata={"unit": "1", "quantity": "quality"})
+        quality = pa.field(DETECTED_RATIO, pa.float32(), metadata={"unit": "1", "quantity": "quality"})
         return [*displacements, quality]
 
     def values(self, image: Bytes) -> AnyFloats:
-        """Return the displacements in the next frame (marker and axis,), and the fraction of detected markers.
+        """Return the displacements in the next frame (marker and axis,), and the fraction of markers that are found.
 
-        Raises `TacpipeError` if the first frame has no grid of markers.
+        Until the grid is known, displacements are NaN and the fraction is 0. Raises `TacpipeError` if the first frames
+        have no grid of markers.
         """
+        self._look(image)
         if self._tracker is None:
-            use_one_thread()  # a stage uses one core per recording
-            grid = find_grid(image, self._rows, self._columns)
-            if grid is None:
-                raise TacpipeError(
-                    f"{self._place}: no grid of dark markers is seen in the first frame. Use `tacpipe extract "
-                    f"difference` for a gel without markers."
-                )
-            self._tracker = MarkerTracker(grid, image)
-            self._scale = self._pitch_mm / grid.pitch_px if self._pitch_mm else 1.0
-        positions_px, is_detected = self._tracker.step(image)
+            return np.append(np.full(2 * self._rows * self._columns, np.nan), 0)
         grid = self._tracker.grid
-        exists = ~np.isnan(grid.positions_px[:, 0])
-        moved = self._scale * (positions_px - grid.positions_px)  # (marker, xy)
-        return np.append(moved.ravel(), is_detected[exists].mean())
+        moved_px = self._tracker.step(image) - grid.positions_px  # (marker, xy)
+        ratio = np.count_nonzero(~np.isnan(moved_px[:, 0])) / np.count_nonzero(grid.exists)
+        return np.append(moved_px.ravel() * (self._pitch_mm / grid.pitch_px if self._pitch_mm else 1.0), ratio)
 
     def skip(self) -> None:
-        """Leave out the next frame. Raises `TacpipeError` if it is the first."""
-        if self._tracker is None:
-            raise TacpipeError(
-                f"{self._place}: the first frame, which shows the untouched gel, is damaged. Leave the recording out with "
-                f"--skip-bad."
-            )
+        """Leave out the next frame. Raises `TacpipeError` if the first frames have no grid of markers."""
+        self._look(None)
+
+    def _look(self, image: Bytes | None) -> None:
+        """Look for the grid of markers in the next frame, None for a damaged one, until it is known."""
+        if self._tracker is not None:
+            return
+        search = self._search
+        if grid := search.add(image):
+            self._tracker = MarkerTracker(grid)
+        elif search.frames_left <= 0:
+            raise TacpipeError(f"{self._place}: {_describe_failure(search)}")
+
+
+def _describe_failure(search: GridSearch) -> str:
+    """Return why the first frames have no grid of markers, and what to do."""
+    if search.frames == 0:
+        return (
+            "all frames that show the untouched gel are damaged. Give more with --reference-frames, or leave the "
+            "recording out with --skip-bad."
+        )
+    if search.dots < MIN_DOTS:
+        return (
+            "no markers are seen in the first frames. Give more with --reference-frames if the recording starts dark, or "
+            "use `tacpipe extract difference` for a gel without markers."
+        )
+    return (
+        f"at most {search.dots} dots are seen in the first frames, and {search.found} of them are in a grid of "
+        f"{search.rows} x {search.columns} markers, less than half. Choose --rows and --columns of the gel. Other layouts "
+        f"than rows and columns are not supported."
+    )
 
 
 def _place(row: int, column: int, columns: int) -> dict[str, str]:

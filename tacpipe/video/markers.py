@@ -1,42 +1,76 @@
-"""Find the printed markers of a gel in images, order them into a grid, and track them from frame to frame.
+"""Find the printed markers of a gel in images, and track them from frame to frame.
 
-Markers are dark dots on a brighter gel. They are detected in every frame, with centroids weighted by darkness. Between
-frames, pyramidal Lucas-Kanade (Bouguet 2001, OpenCV) predicts where each marker is; the detection next to this prediction
-is its position, so positions do not drift. A marker that is not detected keeps the predicted position for a few frames
-and is missing after them, until a detection is where its neighbours suggest. OpenCV is imported when it is needed.
+Markers are dots that are darker or lighter than the gel. They are detected in every frame, with centroids weighted by
+their contrast, so positions do not drift. A marker is the dot next to its last position. Dots that contradict the order
+of the grid are not assigned, and `tacpipe.video.lattice` assigns them again from the rest of the grid. OpenCV is imported
+when it is needed.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from tacpipe.arrays import Bools, Bytes, Floats, Int64s
 from tacpipe.plugins import extras
+from tacpipe.video.lattice import Lattice, order_dots
+
+Polarity = Literal["auto", "dark", "light"]
 
 NEEDED_BY = "Tracking markers"  # start of the error about a missing extra
 MIN_DARKNESS = 0.12  # minimum fraction by which a marker is darker than the surrounding gel
 MIN_AREA_PX = 12  # minimum area of a marker
 AREA_RATIO = 3.0  # maximum ratio of a marker's area to the median area
 NEIGHBOURHOOD = 8  # the gel around a marker is a square of the image's width divided by this
-NEXT = 0.4  # maximum distance in pitches between a detection and a marker's expected position
-CONFIRMED_PX = 0.5  # maximum distance after tracking a marker forwards and backwards
-UNCONFIRMED_FRAMES = 5  # number of frames for which a marker is tracked without a detection
-WINDOW_PX, LEVELS = 21, 3  # Lucas-Kanade: side of the window, and pyramid levels
+MIN_SHARE = 0.5  # minimum fraction of the requested markers that a grid must have
+MAX_DOTS = 3  # maximum ratio of dots to markers; an image with more shows no markers
+RECALLED_FRAMES = 5  # number of frames for which the last position of a lost marker is used
+FAST = 0.25  # median displacement between two frames, in pitches, above which neighbours may be mistaken for each other
+# distance from the position at rest in pitches, and the minimum fraction of markers that are closer
+AT_REST = (0.1, 0.8)
+NEAR_REST = (0.25, 0.5)
 
 
 @dataclass(frozen=True)
 class MarkerGrid:
-    """Undisplaced markers of a gel: a grid of rows and columns, row by row."""
+    """The requested markers of a gel, row by row, and the lattice of all markers to which they belong."""
 
     rows: int
     columns: int
-    positions_px: Floats  # (marker, xy), or NaN if no marker was detected
-    pitch_px: float  # distance between neighbours
+    lattice: Lattice
+    top: int  # row of the lattice that is the first of the grid
+    left: int
+    is_light: bool
+
+    @cached_property
+    def markers(self) -> Int64s:
+        """The markers of the lattice (marker,), -1 beyond its border."""
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns) + np.array([[self.top], [self.left]])
+        is_inside = (row < self.lattice.rows) & (column < self.lattice.columns)
+        return np.where(is_inside, row * self.lattice.columns + column, -1)
+
+    @property
+    def pitch_px(self) -> float:
+        """The distance between neighbours."""
+        return self.lattice.pitch_px
+
+    @cached_property
+    def exists(self) -> Bools:
+        """Whether each marker was detected (marker,)."""
+        return ~np.isnan(self.positions_px[:, 0])
+
+    @cached_property
+    def positions_px(self) -> Floats:
+        """The undisplaced positions (marker, xy), NaN if a marker was not detected."""
+        return self.select(self.lattice.rest_px)
+
+    def select(self, positions_px: Floats) -> Floats:
+        """Return the positions of the requested markers (marker, xy) from those of the lattice."""
+        return np.where(self.markers[:, None] >= 0, positions_px[self.markers], np.nan)
 
 
 def use_one_thread() -> None:
@@ -46,68 +80,96 @@ def use_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def detect(grey: Bytes) -> Floats:
-    """Return the centroids in px (marker, xy) of the dark dots in an image (height, width), except at its border.
+def detect(grey: Bytes, *, is_light: bool = False) -> Floats:
+    """Return the centroids in px (dot, xy) of the dark or light dots in an image (height, width), except at its border.
 
     Raises `MissingModuleError` if OpenCV is not installed.
     """
     with extras.explain_missing(NEEDED_BY):
         import cv2
     side = max(3, grey.shape[1] // NEIGHBOURHOOD | 1)
-    smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
-    surroundings = cv2.boxFilter(smooth, -1, (side, side), borderType=cv2.BORDER_REPLICATE)
-    excess = np.clip(1 - smooth / np.maximum(surroundings, 1) - MIN_DARKNESS, 0, None)  # (height, width)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((excess > 0).astype(np.uint8), connectivity=4)
-    left, top, width, height, area = stats.T
-    inside = (left > 0) & (top > 0) & (left + width < grey.shape[1]) & (top + height < grey.shape[0])
-    is_dot = inside & (area >= MIN_AREA_PX) & (np.maximum(width, height) < 2.5 * np.minimum(width, height))
-    is_dot[0] = False  # the gel
+    smooth = cv2.GaussianBlur(255 - grey if is_light else grey, (5, 5), 0)
+    surroundings = cv2.boxFilter(smooth, cv2.CV_32F, (side, side), borderType=cv2.BORDER_REPLICATE)
+    is_marked = smooth < (1 - MIN_DARKNESS) * surroundings  # (height, width)
+    count, labels = cv2.connectedComponents(is_marked.view(np.uint8), connectivity=4)
+    marked = np.flatnonzero(is_marked)  # (pixel,)
+    places = np.array(np.divmod(marked, grey.shape[1]))[::-1]  # (xy, pixel)
+    dot = labels.ravel()[marked].astype(np.int64) - 1
+    area = np.bincount(dot, minlength=count - 1)
+    first, last = np.full((2, count - 1), max(grey.shape)), np.zeros((2, count - 1), np.int64)  # (xy, dot)
+    for axis in (0, 1):
+        np.minimum.at(first[axis], dot, places[axis])
+        np.maximum.at(last[axis], dot, places[axis])
+    is_inside = ((first > 0) & (last + 1 < np.array([grey.shape[::-1]]).T)).all(axis=0)
+    sides = last - first + 1
+    is_dot = is_inside & (area >= MIN_AREA_PX) & (sides.max(axis=0) < 2.5 * sides.min(axis=0))
     if not is_dot.any():
         return np.empty((0, 2))
     median_area = np.median(area[is_dot])
     is_dot &= (area < AREA_RATIO * median_area) & (area > median_area / AREA_RATIO)
-    flat, weights = labels.ravel(), excess.ravel().astype(np.float64)
-    sums = np.bincount(flat, weights, count)
-    y, x = np.indices(grey.shape)
-    centroids = [np.bincount(flat, weights * axis.ravel(), count) / np.maximum(sums, 1e-12) for axis in (x, y)]
+    weights = 1 - MIN_DARKNESS - smooth.ravel()[marked] / surroundings.ravel()[marked]
+    sums = np.maximum(np.bincount(dot, weights), 1e-12)
+    centroids = [np.bincount(dot, weights * along) / sums for along in places]
     dots_px: Floats = np.column_stack(centroids)[is_dot]
     return dots_px
 
 
-def find_grid(grey: Bytes, rows: int, columns: int) -> MarkerGrid | None:
-    """Return the markers of an image as a grid of ``rows`` and ``columns``, or None if no dots are neighbours.
+def find_grid(dots: Floats, centre_px: Floats, rows: int, columns: int, *, is_light: bool = False) -> MarkerGrid | None:
+    """Return detected dots as a grid of ``rows`` and ``columns``, or None if no dots are neighbours.
 
-    For a larger grid, the part with the most markers is used, and of several the one nearest to the image's centre.
-    Rows are within 30 degrees of the x axis.
+    For a larger lattice, the part with the most markers is used, and of several the one nearest to the image's centre.
     """
-    detections = detect(grey)
-    if len(detections) < 4:
+    lattice = order_dots(dots, centre_px)
+    if lattice is None:
         return None
-    centre = np.array(grey.shape[::-1]) / 2
-    steps = _steps(detections)
-    if steps is None:
-        return None
-    cells = _cells(detections, steps, int(np.argmin(np.linalg.norm(detections - centre, axis=1))))
-    row_first, column_first = min(index[0] for index in cells), min(index[1] for index in cells)
-    row_last, column_last = max(index[0] for index in cells), max(index[1] for index in cells)
 
-    def rank(corner: tuple[int, int]) -> tuple[int, float]:
-        """Rank a part of the grid by its markers and its distance from the centre of the image."""
-        part = [
-            detections[marker]
-            for (row, column), marker in cells.items()
-            if 0 <= row - corner[0] < rows and 0 <= column - corner[1] < columns
-        ]
-        return -len(part), float(np.linalg.norm(np.mean(part, axis=0) - centre)) if part else np.inf
+    def rank(grid: MarkerGrid) -> tuple[int, float]:
+        """Rank a part of the lattice by its markers and its distance from the centre of the image."""
+        part = grid.positions_px[grid.exists]
+        return -len(part), float(np.linalg.norm(part.mean(axis=0) - centre_px)) if len(part) else np.inf
 
-    tops = range(row_first, max(row_first, row_last - rows + 1) + 1)
-    lefts = range(column_first, max(column_first, column_last - columns + 1) + 1)
-    top, left = min(product(tops, lefts), key=rank)
-    positions = np.full((rows * columns, 2), np.nan)
-    for (row, column), marker in cells.items():
-        if 0 <= row - top < rows and 0 <= column - left < columns:
-            positions[(row - top) * columns + column - left] = detections[marker]
-    return MarkerGrid(rows, columns, positions, float(np.linalg.norm(steps, axis=1).mean()))
+    corners = product(range(max(1, lattice.rows - rows + 1)), range(max(1, lattice.columns - columns + 1)))
+    return min((MarkerGrid(rows, columns, lattice, top, left, is_light) for top, left in corners), key=rank)
+
+
+@dataclass
+class GridSearch:
+    """Looks for the grid of markers in the first frames, which show the untouched gel.
+
+    The first frame with all markers is used, or else the one with the most markers.
+    """
+
+    rows: int
+    columns: int
+    polarity: Polarity
+    frames_left: int
+    best: MarkerGrid | None = field(default=None, init=False)
+    frames: int = field(default=0, init=False)  # frames that were not damaged
+    dots: int = field(default=0, init=False)  # largest number of dots in a frame
+
+    def add(self, grey: Bytes | None) -> MarkerGrid | None:
+        """Look at the next frame, None for a damaged one, and return the grid as soon as it is final.
+
+        If it has less than `MIN_SHARE` of the markers, the result is None although ``frames_left`` is 0.
+        """
+        self.frames_left -= 1
+        self.frames += grey is not None
+        for is_light in (False, True):
+            if grey is None or self.polarity == ("dark" if is_light else "light"):
+                continue
+            dots = detect(grey, is_light=is_light)
+            self.dots = max(self.dots, len(dots))
+            grid = find_grid(dots, np.array(grey.shape[::-1]) / 2, self.rows, self.columns, is_light=is_light)
+            if grid is not None and grid.exists.sum() > self.found:
+                self.best = grid
+        is_complete = self.found == self.rows * self.columns
+        has_enough = self.found >= MIN_SHARE * self.rows * self.columns
+        return self.best if is_complete or (has_enough and self.frames_left <= 0) else None
+
+    @property
+    def found(self) -> int:
+        """The number of markers of the best grid."""
+        return 0 if self.best is None else int(self.best.exists.sum())
 
 
 @dataclass
@@ -115,116 +177,51 @@ class MarkerTracker:
     """Tracks the markers of a grid frame by frame. A position does not depend on later frames."""
 
     grid: MarkerGrid
-    previous: Bytes  # image for which `positions_px` are valid
-    positions_px: Floats = field(init=False)  # (marker, xy); NaN if missing
-    unconfirmed: Int64s = field(init=False)  # (marker,), number of frames since the last detection
+    _last_px: Floats = field(init=False)  # last position of each marker of the lattice (marker, xy)
+    _frames_lost: Int64s = field(init=False)  # (marker,), number of frames since the last detection
+    _is_doubtful: bool = field(default=False, init=False)  # whether all markers may be mistaken for their neighbours
 
     def __post_init__(self) -> None:
-        self.positions_px = self.grid.positions_px.copy()
-        self.unconfirmed = np.zeros(len(self.positions_px), np.int64)
+        self._last_px = self.grid.lattice.rest_px.copy()
+        self._frames_lost = np.zeros(len(self._last_px), np.int64)
 
-    def step(self, grey: Bytes) -> tuple[Floats, Bools]:
-        """Return positions in the next image in px (marker, xy), NaN if missing, and whether each was detected (marker,)."""
-        expected, is_confirmed = self._predict(grey)
-        detections = detect(grey)
-        detected = self._match(expected, detections, np.full(len(expected), -1))
-        lost = (detected < 0) & ~np.isnan(self.grid.positions_px[:, 0])
-        suggested = np.where(lost[:, None], self._suggest(detected, detections), np.nan)
-        detected = self._match(suggested, detections, detected)
-        is_detected = detected >= 0
-        self.unconfirmed = np.where(is_detected, 0, self.unconfirmed + 1)
-        keeps = ~is_detected & is_confirmed & (self.unconfirmed <= UNCONFIRMED_FRAMES)
-        positions = np.where(keeps[:, None], expected, np.nan)
-        positions[is_detected] = detections[detected[is_detected]]
-        self.positions_px, self.previous = positions, grey
-        return positions, is_detected
+    def step(self, grey: Bytes) -> Floats:
+        """Return the positions in the next image in px (marker, xy), NaN if a marker is missing."""
+        dots = detect(grey, is_light=self.grid.is_light)
+        if len(dots) > MAX_DOTS * self.grid.lattice.exists.sum():
+            dots = dots[:0]
+        assigned = self._assign(dots)
+        is_found = assigned >= 0
+        self._frames_lost = np.where(is_found, 0, self._frames_lost + 1)
+        self._last_px[is_found] = dots[assigned[is_found]]
+        return self.grid.select(np.where(is_found[:, None], self._last_px, np.nan))
 
-    def _predict(self, grey: Bytes) -> tuple[Floats, Bools]:
-        """Return the positions predicted by Lucas-Kanade (marker, xy), and whether backward tracking agrees (marker,)."""
-        import cv2
+    def _assign(self, dots: Floats) -> Int64s:
+        """Return the dot of each marker of the lattice (marker,), -1 for none."""
+        lattice = self.grid.lattice
+        is_known = lattice.exists & (self._frames_lost <= RECALLED_FRAMES)
+        assigned, contradicted = lattice.assign(np.where(is_known[:, None], self._last_px, np.nan), dots)
+        assigned = lattice.complete(assigned, dots)
+        has_lost = bool((is_known & (self._frames_lost == 0) & (assigned < 0)).any())
+        if contradicted or has_lost:
+            assigned = lattice.rebuild(assigned, dots)
+        is_found = assigned >= 0
+        if is_found.any():
+            moved = np.linalg.norm(dots[assigned[is_found]] - self._last_px[is_found], axis=1)
+            self._is_doubtful |= bool(np.median(moved) > FAST * lattice.pitch_px)
+        self._is_doubtful |= bool(2 * is_found.sum() < is_known.sum())
+        at_rest = self._near_rest(dots, *AT_REST) if self._is_doubtful else None
+        if at_rest is not None and (at_rest >= 0).sum() >= is_found.sum():
+            self._is_doubtful = False
+            return at_rest
+        if not is_known.any() and (near_rest := self._near_rest(dots, *NEAR_REST)) is not None:
+            return near_rest
+        return assigned
 
-        expected, is_confirmed = np.full_like(self.positions_px, np.nan), np.zeros(len(self.positions_px), bool)
-        tracked = np.flatnonzero(~np.isnan(self.positions_px[:, 0]))
-        if not len(tracked):
-            return expected, is_confirmed
-        track: Any = partial(cv2.calcOpticalFlowPyrLK, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS)
-        start = self.positions_px[tracked].astype(np.float32)[:, None]
-        moved, is_tracked, _ = track(self.previous, grey, start, None)
-        returned, is_returned, _ = track(grey, self.previous, moved, None)
-        agrees = np.linalg.norm((returned - start)[:, 0], axis=1) < CONFIRMED_PX
-        usable = is_tracked.ravel().astype(bool)
-        expected[tracked[usable]] = moved[usable, 0]
-        is_confirmed[tracked] = usable & is_returned.ravel().astype(bool) & agrees
-        return expected, is_confirmed
-
-    def _match(self, expected: Floats, detections: Floats, detected: Int64s) -> Int64s:
-        """Return the detection of each marker (marker,), -1 for none; markers in ``detected`` keep theirs."""
-        matched = detected.copy()
-        free = np.setdiff1d(np.arange(len(detections)), detected)
-        undetected = np.flatnonzero((detected < 0) & ~np.isnan(expected[:, 0]))
-        if len(free) and len(undetected):
-            distances = np.linalg.norm(expected[undetected][:, None] - detections[free], axis=2)  # (marker, detection)
-            nearest, nearest_marker = distances.argmin(axis=1), distances.argmin(axis=0)
-            mutual = nearest_marker[nearest] == np.arange(len(undetected))
-            close = distances.min(axis=1) < NEXT * self.grid.pitch_px
-            matched[undetected[mutual & close]] = free[nearest[mutual & close]]
-        return matched
-
-    def _suggest(self, detected: Int64s, detections: Floats) -> Floats:
-        """Return positions of markers (marker, xy) from the displacements of detected neighbours, NaN without any."""
-        shape = (self.grid.rows, self.grid.columns, 2)
-        displacements = np.full_like(self.grid.positions_px, np.nan)
-        is_detected = detected >= 0
-        displacements[is_detected] = detections[detected[is_detected]] - self.grid.positions_px[is_detected]
-        padded = np.pad(displacements.reshape(shape), ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-        shifted = [
-            padded[row : row + shape[0], column : column + shape[1]]
-            for row, column in product(range(3), repeat=2)
-            if (row, column) != (1, 1)
-        ]
-        stack = np.array(shifted).reshape(8, -1, 2)  # (neighbour, marker, xy)
-        count = (~np.isnan(stack)).sum(axis=0)
-        mean = np.nansum(stack, axis=0) / np.where(count, count, np.nan)
-        suggested: Floats = self.grid.positions_px + mean
-        return suggested
-
-
-def _steps(detections: Floats) -> Floats | None:
-    """Return the median offsets to the next column and row in px (2, xy), or None if no markers are neighbours."""
-    offsets = detections[None] - detections[:, None]  # (marker, other, xy)
-    distances = np.linalg.norm(offsets, axis=2) + np.diag(np.full(len(detections), np.inf))
-    steps = []
-    for along, across in ((0, 1), (1, 0)):
-        is_along = (offsets[..., along] > 0) & (np.abs(offsets[..., across]) < 0.6 * offsets[..., along])
-        ranked = np.where(is_along, distances, np.inf)
-        nearest = ranked.argmin(axis=1)
-        has_neighbour = np.isfinite(ranked.min(axis=1))
-        if not has_neighbour.any():
+    def _near_rest(self, dots: Floats, limit: float, min_share: float) -> Int64s | None:
+        """Return an assignment if at least a share of the markers is within a limit in pitches of their rest."""
+        lattice = self.grid.lattice
+        assigned, _ = lattice.assign(lattice.rest_px, dots, limit)
+        if (assigned >= 0).sum() < min_share * lattice.exists.sum():
             return None
-        steps.append(np.median(offsets[np.flatnonzero(has_neighbour), nearest[has_neighbour]], axis=0))
-    return np.array(steps)
-
-
-def _cells(detections: Floats, steps: Floats, first: int) -> dict[tuple[int, int], int]:
-    """Return the index of the detection in each cell (row, column), spreading from the detection ``first`` in cell (0, 0).
-
-    ``steps`` are those that `_steps` returns.
-    """
-    pitch = float(np.linalg.norm(steps, axis=1).mean())
-    cells = {(0, 0): first}
-    assigned = {first}
-    pending = [(0, 0)]
-    while pending:
-        row, column = pending.pop(0)
-        position = detections[cells[row, column]]
-        for row_step, column_step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            cell = (row + row_step, column + column_step)
-            if cell in cells:
-                continue
-            distances = np.linalg.norm(detections - (position + column_step * steps[0] + row_step * steps[1]), axis=1)
-            nearest = int(distances.argmin())
-            if distances[nearest] < NEXT * pitch and nearest not in assigned:
-                cells[cell] = nearest
-                assigned.add(nearest)
-                pending.append(cell)
-    return cells
+        return lattice.complete(assigned, dots)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +15,7 @@ from tacpipe.datasets.dataset import Recording
 from tacpipe.store.records import Step
 from tacpipe.traces.curves import TIME
 from tacpipe.video.decoding import read_frames
-from tacpipe.video.markers import find_grid
+from tacpipe.video.markers import GridSearch
 from tacpipe.video.stream import read_format
 
 STAGE = "extract.markers"
@@ -36,8 +37,7 @@ def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequenc
     """Return the markers of a stream of displacements in the frames of the stream of the same name of ``video``.
 
     Returns None if the stream contains no marker displacements, or ``video`` has no such frames, or no grid of markers
-    is found. The markers at rest are found in the first frame, as in `extract markers`. Raises `TacpipeError` if the
-    frame cannot be decoded.
+    is found. The markers at rest are found in the first frames, as in `extract markers`.
     """
     names_by_position = _names_by_position(table)
     if not names_by_position or TIME not in table.column_names or stream not in video.streams:
@@ -46,14 +46,18 @@ def track_markers(stream: str, table: pa.Table, video: Recording, chain: Sequenc
     if read_format(frames) is None or not frames.num_rows:
         return None
     rows, columns = (max(position[axis] for position in names_by_position) for axis in (0, 1))
-    grid = find_grid(read_frames(frames, [0], grey=True)[0], rows, columns)
+    params: Mapping[str, Any] = next((step["params"] for step in chain if step["stage"] == STAGE), {})
+    count = min(params.get("reference_frames", 1), frames.num_rows)
+    images = read_frames(frames, range(count), grey=True)
+    search = GridSearch(rows, columns, params.get("polarity", "dark"), count)
+    grid = next(filter(None, (search.add(images.get(row)) for row in range(count))), None)
     if grid is None:
         return None
     displacements = np.full((table.num_rows, rows * columns, 2), np.nan)
     for (row, column, axis), name in names_by_position.items():
         values = table.column(name).to_numpy().astype(np.float64)
         displacements[:, (row - 1) * columns + column - 1, axis] = values
-    pitch_mm = next((step["params"].get("pitch_mm") for step in chain if step["stage"] == STAGE), None)
+    pitch_mm = params.get("pitch_mm")
     if isinstance(pitch_mm, int | float) and pitch_mm:
         displacements *= grid.pitch_px / pitch_mm
     return MarkerTrack(stream, table.column(TIME).to_numpy(), grid.positions_px, grid.positions_px + displacements)

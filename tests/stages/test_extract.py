@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import tacpipe
+from tacpipe.arrays import Floats
 from tacpipe.channels.places import taxel_positions
 from tacpipe.channels.streams import columns_with_quantity
 from tacpipe.errors import TacpipeError, UsageError
@@ -154,21 +155,58 @@ def test_displacements_do_not_change_when_later_frames_are_cut_off(pressed_gel: 
     assert extract({"gel": pressed_gel.slice(0, stop)}, "extract.markers")["gel"].equals(complete.slice(0, stop))
 
 
-def test_a_marker_that_is_not_there_is_null(tmp_path: Path) -> None:
+def test_a_marker_that_is_not_there_is_null_and_so_are_the_rows_until_the_reference_is_known(tmp_path: Path) -> None:
     places = np.delete(gels.places(4, 6), 9, axis=0)
-    images = np.array([gels.image(places, frame) for frame in range(3)])
+    images = np.array([gels.image(places, frame) for frame in range(7)])
     frames = frames_of(videos.write_images(tmp_path / "gel.mkv", "ffv1", images))
-    table = extract({"gel": frames}, "extract.markers")["gel"]
-    nulls = [name for name in table.column_names if table.column(name).null_count]
-    assert nulls == ["taxel0204_x", "taxel0204_y"]
-    assert table.column("taxel0204_x").null_count == 3
+    table = extract({"gel": frames}, "extract.markers", reference_frames=3)["gel"]
+    nulls = {name: table.column(name).null_count for name in table.column_names if name.startswith("taxel")}
+    absent = {"taxel0204_x", "taxel0204_y"}
+    assert nulls == {name: 7 if name in absent else 2 for name in nulls}
+    assert table.column("detected_ratio").to_pylist() == [0, 0, 1, 1, 1, 1, 1]
 
 
-def test_a_gel_without_markers_is_refused_in_a_sentence(video: Path) -> None:
-    with pytest.raises(
-        TacpipeError, match=r"Recording trial, stream gel: no grid of dark markers .* extract difference"
-    ):
-        extract({"gel": frames_of(video)}, "extract.markers")
+def test_light_markers_have_the_displacements_of_dark_ones(tmp_path: Path) -> None:
+    places = gels.places()
+    images = np.array([gels.image(gels.press(places, depth), frame) for frame, depth in enumerate((0.0, 0.5, 1.0))])
+    tables = []
+    for name, shown in (("dark", images), ("light", 255 - images)):
+        frames = frames_of(videos.write_images(tmp_path / f"{name}.mkv", "ffv1", shown))
+        tables.append(extract({"gel": frames}, "extract.markers")["gel"])
+        fixed = extract({"gel": frames}, "extract.markers", polarity=name)["gel"]
+        assert fixed.equals(tables[-1])
+    dark, light = ([table.column(name).to_numpy() for name in table.column_names[2:]] for table in tables)
+    assert np.abs(np.array(dark) - light).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("places", "sentence"),
+    [
+        (np.empty((0, 2)), r"no markers are seen in the first frames\. .* extract difference"),
+        (
+            np.array([[40, 40], [90, 60], [60, 120], [200, 50], [250, 180], [150, 210]]),
+            "at most 6 dots .* less than half",
+        ),
+    ],
+)
+def test_a_gel_without_markers_and_other_layouts_are_refused_in_a_sentence(
+    tmp_path: Path, places: Floats, sentence: str
+) -> None:
+    frames = frames_of(videos.write_images(tmp_path / "gel.mkv", "ffv1", np.array([gels.image(places)] * 6)))
+    with pytest.raises(TacpipeError, match=f"Recording trial, stream gel: {sentence}") as raised:
+        extract({"gel": frames}, "extract.markers")
+    assert ("extract difference" in str(raised.value)) == (not len(places))
+
+
+def test_markers_are_found_again_after_dark_frames_and_a_note_states_how_many_rows_lack_them(tmp_path: Path) -> None:
+    image = gels.image(gels.places())
+    images = np.array([image] * 6)
+    images[[0, 2, 3]] = 0
+    frames = frames_of(videos.write_images(tmp_path / "gel.mkv", "ffv1", images))
+    output = load("extract.markers").function(build_params("extract.markers"), FakeRecording({"gel": frames}))
+    ratios = output.streams["gel"].read_all().column("detected_ratio").to_pylist()
+    assert ratios == [0, 1, 0, 0, 1, 1]
+    assert output.notes == ["Stream gel: fewer than half of the markers are found in 3 of 6 frames."]
 
 
 @pytest.mark.long
