@@ -19,7 +19,7 @@ from tacpipe.arrays import Bools, Floats, Int64s
 MIN_DOTS = 4  # minimum number of dots of a lattice
 NEXT = 0.4  # maximum distance in pitches between a dot and a marker's expected position
 NEXT_BY_PASS = (0.15, 0.25, NEXT)  # the same for each pass of `Lattice.rebuild`
-MAX_STRAIN = 0.6  # maximum difference in pitches between the offset of two neighbours and the step of the lattice
+MAX_STRAIN = 0.7  # maximum difference in pitches between the offset of two neighbours and the step of the lattice
 SOUND_STRAIN = 0.3  # the same for markers from which an assignment is rebuilt
 
 
@@ -78,7 +78,7 @@ class Lattice:
     def complete(self, assigned: Int64s, dots: Floats, limits: Sequence[float] = (NEXT,)) -> Int64s:
         """Return an assignment with further markers where their neighbours suggest them, with one pass per limit."""
         for limit in limits:
-            while (missing := self.exists & (assigned < 0)).any():
+            while (missing := self.exists & (assigned < 0)).any() and np.count_nonzero(assigned >= 0) < len(dots):
                 suggested = np.where(missing[:, None], self._suggest(self._offsets(assigned, dots)), np.nan)
                 more, _ = self._without_contradictions(self._match(assigned, suggested, dots, limit), dots)
                 if np.count_nonzero(more >= 0) <= np.count_nonzero(assigned >= 0):

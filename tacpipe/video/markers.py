@@ -29,7 +29,7 @@ NEIGHBOURHOOD = 8  # the gel around a marker is a square of the image's width di
 MIN_SHARE = 0.5  # minimum fraction of the requested markers that a grid must have
 MAX_DOTS = 3  # maximum ratio of dots to markers; an image with more shows no markers
 RECALLED_FRAMES = 5  # number of frames for which the last position of a lost marker is used
-FAST = 0.25  # median displacement between two frames, in pitches, above which neighbours may be mistaken for each other
+FAST = 0.25  # displacement between two frames in pitches; if most markers exceed it, all may be mistaken for neighbours
 # distance from the position at rest in pitches, and the minimum fraction of markers that are closer
 AT_REST = (0.1, 0.8)
 NEAR_REST = (0.25, 0.5)
@@ -203,13 +203,13 @@ class MarkerTracker:
         assigned, contradicted = lattice.assign(np.where(is_known[:, None], self._last_px, np.nan), dots)
         assigned = lattice.complete(assigned, dots)
         has_lost = bool((is_known & (self._frames_lost == 0) & (assigned < 0)).any())
-        if contradicted or has_lost:
+        if contradicted or (has_lost and np.count_nonzero(assigned >= 0) < len(dots)):
             assigned = lattice.rebuild(assigned, dots)
         is_found = assigned >= 0
-        if is_found.any():
-            moved = np.linalg.norm(dots[assigned[is_found]] - self._last_px[is_found], axis=1)
-            self._is_doubtful |= bool(np.median(moved) > FAST * lattice.pitch_px)
-        self._is_doubtful |= bool(2 * is_found.sum() < is_known.sum())
+        moved_px = np.linalg.norm(dots[assigned[is_found]] - self._last_px[is_found], axis=1)
+        are_fast = 2 * np.count_nonzero(moved_px > FAST * lattice.pitch_px) > len(moved_px)
+        are_lost = 2 * np.count_nonzero(is_found) < np.count_nonzero(is_known)
+        self._is_doubtful = self._is_doubtful or bool(are_fast or are_lost)
         at_rest = self._near_rest(dots, *AT_REST) if self._is_doubtful else None
         if at_rest is not None and (at_rest >= 0).sum() >= is_found.sum():
             self._is_doubtful = False
