@@ -39,7 +39,7 @@ class Lattice:
 
     @cached_property
     def exists(self) -> Bools:
-        """Whether a dot was found for each marker (marker,)."""
+        """True for each marker for which a dot was found (marker,)."""
         return ~np.isnan(self.rest_px[:, 0])
 
     @cached_property
@@ -80,10 +80,10 @@ class Lattice:
         for limit in limits:
             while (missing := self.exists & (assigned < 0)).any() and np.count_nonzero(assigned >= 0) < len(dots):
                 suggested = np.where(missing[:, None], self._suggest(self._offsets(assigned, dots)), np.nan)
-                more, _ = self._without_contradictions(self._match(assigned, suggested, dots, limit), dots)
-                if np.count_nonzero(more >= 0) <= np.count_nonzero(assigned >= 0):
+                extended, _ = self._without_contradictions(self._match(assigned, suggested, dots, limit), dots)
+                if np.count_nonzero(extended >= 0) <= np.count_nonzero(assigned >= 0):
                     break
-                assigned = more
+                assigned = extended
         return assigned
 
     def rebuild(self, assigned: Int64s, dots: Floats) -> Int64s:
@@ -109,8 +109,8 @@ class Lattice:
     def _offsets(self, assigned: Int64s, dots: Floats) -> Floats:
         """Return offsets from the regular lattice (marker + 1, xy), NaN without a dot; the last stands for the border."""
         offsets = np.full((len(assigned) + 1, 2), np.nan)
-        found = np.flatnonzero(assigned >= 0)
-        offsets[found] = dots[assigned[found]] - self._points_px[found]
+        markers = np.flatnonzero(assigned >= 0)
+        offsets[markers] = dots[assigned[markers]] - self._points_px[markers]
         return offsets
 
     def _strain(self, offsets: Floats) -> Floats:
@@ -185,9 +185,9 @@ def order_dots(dots: Floats, centre_px: Floats) -> Lattice | None:
     places = np.array(list(cells))  # (dot, row and column)
     places -= places.min(axis=0)
     rows, columns = (int(last) + 1 for last in places.max(axis=0))
-    rest = np.full((rows, columns, 2), np.nan)
-    rest[places[:, 0], places[:, 1]] = dots[list(cells.values())]
-    return Lattice(rows, columns, rest.reshape(-1, 2), steps)
+    rest_px = np.full((rows, columns, 2), np.nan)
+    rest_px[places[:, 0], places[:, 1]] = dots[list(cells.values())]
+    return Lattice(rows, columns, rest_px.reshape(-1, 2), steps)
 
 
 def _steps(dots: Floats) -> Floats | None:
@@ -197,7 +197,7 @@ def _steps(dots: Floats) -> Floats | None:
     steps = []
     for along, across in ((0, 1), (1, 0)):
         is_along = (offsets[..., along] > 0) & (np.abs(offsets[..., across]) < 0.8 * offsets[..., along])
-        # of two equally near dots in a hexagonal layout, always the one to the lower right
+        # the second term prefers the lower right of two equally near dots in a hexagonal layout
         ranked = np.where(is_along, distances - 0.1 * offsets[..., across], np.inf)
         nearest = ranked.argmin(axis=1)
         has_neighbour = np.isfinite(ranked.min(axis=1))

@@ -29,6 +29,7 @@ NEIGHBOURHOOD = 8  # the gel around a marker is a square of the image's width di
 MIN_SHARE = 0.5  # minimum fraction of the requested markers that a grid must have
 MAX_DOTS = 3  # maximum ratio of dots to markers; an image with more shows no markers
 RECALLED_FRAMES = 5  # number of frames for which the last position of a lost marker is used
+MIN_ANCHORS = 0.25  # minimum fraction of the markers that are followed from earlier frames to find the others
 FAST = 0.25  # displacement between two frames in pitches; if most markers exceed it, all may be mistaken for neighbours
 # distance from the position at rest in pitches, and the minimum fraction of markers that are closer
 AT_REST = (0.1, 0.8)
@@ -42,14 +43,16 @@ class MarkerGrid:
     rows: int
     columns: int
     lattice: Lattice
-    top: int  # row of the lattice that is the first of the grid
-    left: int
+    first_row: int  # row of the lattice that is the first of the grid
+    first_column: int
     is_light: bool
 
     @cached_property
     def markers(self) -> Int64s:
         """The markers of the lattice (marker,), -1 beyond its border."""
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns) + np.array([[self.top], [self.left]])
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns) + np.array(
+            [[self.first_row], [self.first_column]]
+        )
         is_inside = (row < self.lattice.rows) & (column < self.lattice.columns)
         return np.where(is_inside, row * self.lattice.columns + column, -1)
 
@@ -60,7 +63,7 @@ class MarkerGrid:
 
     @cached_property
     def exists(self) -> Bools:
-        """Whether each marker was detected (marker,)."""
+        """True for each marker that was detected (marker,)."""
         return ~np.isnan(self.positions_px[:, 0])
 
     @cached_property
@@ -129,7 +132,7 @@ def find_grid(dots: Floats, centre_px: Floats, rows: int, columns: int, *, is_li
         return -len(part), float(np.linalg.norm(part.mean(axis=0) - centre_px)) if len(part) else np.inf
 
     corners = product(range(max(1, lattice.rows - rows + 1)), range(max(1, lattice.columns - columns + 1)))
-    return min((MarkerGrid(rows, columns, lattice, top, left, is_light) for top, left in corners), key=rank)
+    return min((MarkerGrid(rows, columns, lattice, row, column, is_light) for row, column in corners), key=rank)
 
 
 @dataclass
@@ -160,14 +163,14 @@ class GridSearch:
             dots = detect(grey, is_light=is_light)
             self.dots = max(self.dots, len(dots))
             grid = find_grid(dots, np.array(grey.shape[::-1]) / 2, self.rows, self.columns, is_light=is_light)
-            if grid is not None and grid.exists.sum() > self.found:
+            if grid is not None and grid.exists.sum() > self.marker_count:
                 self.best = grid
-        is_complete = self.found == self.rows * self.columns
-        has_enough = self.found >= MIN_SHARE * self.rows * self.columns
+        is_complete = self.marker_count == self.rows * self.columns
+        has_enough = self.marker_count >= MIN_SHARE * self.rows * self.columns
         return self.best if is_complete or (has_enough and self.frames_left <= 0) else None
 
     @property
-    def found(self) -> int:
+    def marker_count(self) -> int:
         """The number of markers of the best grid."""
         return 0 if self.best is None else int(self.best.exists.sum())
 
@@ -179,7 +182,7 @@ class MarkerTracker:
     grid: MarkerGrid
     _last_px: Floats = field(init=False)  # last position of each marker of the lattice (marker, xy)
     _frames_lost: Int64s = field(init=False)  # (marker,), number of frames since the last detection
-    _is_doubtful: bool = field(default=False, init=False)  # whether all markers may be mistaken for their neighbours
+    _is_doubtful: bool = field(default=False, init=False)  # true if all markers may be mistaken for their neighbours
 
     def __post_init__(self) -> None:
         self._last_px = self.grid.lattice.rest_px.copy()
@@ -201,6 +204,10 @@ class MarkerTracker:
         lattice = self.grid.lattice
         is_known = lattice.exists & (self._frames_lost <= RECALLED_FRAMES)
         assigned, contradicted = lattice.assign(np.where(is_known[:, None], self._last_px, np.nan), dots)
+        if np.count_nonzero(assigned >= 0) < MIN_ANCHORS * np.count_nonzero(lattice.exists):
+            self._is_doubtful = True
+            near_rest = self._near_rest(dots, *NEAR_REST)
+            return assigned if near_rest is None else near_rest
         assigned = lattice.complete(assigned, dots)
         has_lost = bool((is_known & (self._frames_lost == 0) & (assigned < 0)).any())
         if contradicted or (has_lost and np.count_nonzero(assigned >= 0) < len(dots)):
@@ -214,8 +221,6 @@ class MarkerTracker:
         if at_rest is not None and (at_rest >= 0).sum() >= is_found.sum():
             self._is_doubtful = False
             return at_rest
-        if not is_known.any() and (near_rest := self._near_rest(dots, *NEAR_REST)) is not None:
-            return near_rest
         return assigned
 
     def _near_rest(self, dots: Floats, limit: float, min_share: float) -> Int64s | None:
