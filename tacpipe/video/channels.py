@@ -159,8 +159,8 @@ def _describe_failure(search: GridSearch) -> str:
         )
     return (
         f"at most {search.dots} dots are seen in the first frames, and {search.marker_count} of them are in a grid of "
-        f"{search.rows} x {search.columns} markers, less than half. Choose --rows and --columns of the gel. Other layouts "
-        f"than rows and columns are not supported."
+        f"{search.rows} x {search.columns} markers, less than half. Choose --rows and --columns of the gel. Only "
+        f"regular grids, rectangular or hexagonal, are supported."
     )
 
 
