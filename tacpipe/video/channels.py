@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyFloats, Bytes, Float32s
+from tacpipe.arrays import AnyFloats, Bytes, Float32s, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.video.decoding import GREY, FrameDecoder, cell_means, has_lost_block, padded_packet
 from tacpipe.video.encoding import RGB
@@ -41,6 +41,30 @@ class FrameChannels(Protocol):
         """Leave out the next frame, which is damaged. Raises `TacpipeError` if the untouched gel is then unknown."""
 
 
+class UntouchedGel:
+    """The mean of the first ``frames``, which show the untouched gel. ``place`` names the stream in errors."""
+
+    def __init__(self, frames: int, place: str) -> None:
+        self._left, self._place = frames, place
+        self._sum, self._count = np.zeros(1), 0
+
+    def update(self, means: Floats) -> Floats:
+        """Return the mean of the first frames up to the next one, whose means (row, column, colour) are given."""
+        if self._left:
+            self._sum, self._count = self._sum + means, self._count + 1
+            self._left -= 1
+        return self._sum / self._count
+
+    def skip(self) -> None:
+        """Leave out the next frame. Raises `TacpipeError` if all of the first frames are damaged."""
+        self._left = max(0, self._left - 1)
+        if not self._left and not self._count:
+            raise TacpipeError(
+                f"{self._place}: all frames that show the untouched gel are damaged. Give more with --reference-frames, or "
+                f"leave the recording out with --skip-bad."
+            )
+
+
 class DifferenceChannels:
     """The mean brightness of each cell of a grid and colour, minus that of the first frames if there are any.
 
@@ -50,9 +74,8 @@ class DifferenceChannels:
     grey = False
 
     def __init__(self, rows: int, columns: int, reference_frames: int, place: str) -> None:
-        self._rows, self._columns, self._left, self._place = rows, columns, reference_frames, place
-        self._has_reference = reference_frames > 0
-        self._reference_sum, self._reference_count = np.zeros((rows, columns, len(COLOURS))), 0
+        self._rows, self._columns = rows, columns
+        self._untouched = UntouchedGel(reference_frames, place) if reference_frames else None
 
     def fields(self) -> list[pa.Field]:
         """Return the fields ``taxel0101_red`` …, named by row and column from 1 and colour, as float32 grey levels."""
@@ -68,21 +91,12 @@ class DifferenceChannels:
     def values(self, image: Bytes) -> AnyFloats:
         """Return the brightness of the next frame, less the mean of the first frames, flat (cell and colour,)."""
         means = cell_means(image, self._rows, self._columns)
-        if not self._has_reference:
-            return means.ravel()
-        if self._left:
-            self._reference_sum, self._reference_count = self._reference_sum + means, self._reference_count + 1
-            self._left -= 1
-        return (means - self._reference_sum / self._reference_count).ravel()
+        return (means - self._untouched.update(means) if self._untouched else means).ravel()
 
     def skip(self) -> None:
         """Leave out the next frame. Raises `TacpipeError` if all frames that show the untouched gel are damaged."""
-        self._left = max(0, self._left - 1)
-        if self._has_reference and not self._left and not self._reference_count:
-            raise TacpipeError(
-                f"{self._place}: all frames that show the untouched gel are damaged. Give more with --reference-frames, or "
-                f"leave the recording out with --skip-bad."
-            )
+        if self._untouched:
+            self._untouched.skip()
 
 
 class MarkerChannels:
