@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import numpy as np
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io.hashing import file_digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seed, Unit
+from tacpipe.plugins.file_params import pin_file
 from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.plugins.stage import Fitted, RecordingOutput, Result, Workspace, stage
 from tacpipe.plugins.stream_selection import StreamSelection
@@ -127,6 +127,48 @@ def markers(params: MarkerParams, recording: Recording) -> RecordingOutput:
 
 
 @dataclass(frozen=True)
+class DepthParams(StreamSelection):
+    """The map of the gel, the grid, and the frames that show the untouched gel."""
+
+    map: str = ""  # required: result of `tacpipe extract gel-map`
+    map_sha256: str = ""  # sha256 of the map in it; computed if omitted
+    rows: PositiveInt = 12  # rows of the grid
+    columns: PositiveInt = 16  # columns of the grid
+    # number of first frames whose mean is the untouched gel; 0: that of the map, for recordings of single images
+    reference_frames: NonNegativeInt = 5
+    # minimum depth of a contact; deeper contacts begin where the rims of the balls were, as a fraction of their depth
+    contact_mm: Annotated[PositiveFloat, Unit("mm")] = 0.1
+
+    def __post_init__(self) -> None:
+        """Compute the digest of the map, which is part of the key. Raises the errors of `pin_file`."""
+        from tacpipe.video.gel_map import map_path
+
+        digest = pin_file("map", self.map and str(map_path(self.map)), self.map_sha256)
+        object.__setattr__(self, "map_sha256", digest)
+
+
+@stage(version=1)
+def depth(params: DepthParams, recording: Recording) -> RecordingOutput:
+    """Measure the depth of a gel from its colours.
+
+    Each stream of frames becomes a stream of tactile channels with one row per frame: the depth in millimetres on a
+    grid, the area and the volume of the contact, the deepest point from the top left corner of the image, and the
+    fraction of the contact where the map is a guess, because no press was as steep or at that place. The map comes from
+    `tacpipe extract gel-map`. Depth is relative to the flatter half of the image. The first frames of a recording show
+    the untouched gel, so start a recording before contact. No row looks ahead. Streams without frames stay unchanged.
+
+    Example: tacpipe extract depth data/gels --map data/gel -o data/depth
+    """
+    from tacpipe.video.depth import DepthChannels
+
+    def compute(subject: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+        channels = DepthChannels.from_params(params, subject)
+        return _stream_of_values(columns, channels.fields(), _channel_values(columns, video_format, channels))
+
+    return _replace_frames(recording, compute)
+
+
+@dataclass(frozen=True)
 class FrameAutoencoderParams(StreamSelection):
     """Features of the autoencoder, and its training."""
 
@@ -196,18 +238,8 @@ class EncoderParams(StreamSelection):
     weights_sha256: str = ""  # sha256 of that file; computed if omitted
 
     def __post_init__(self) -> None:
-        """Compute the digest of the weights, which is part of the key.
-
-        Raises `UsageError` if it differs from the stated one.
-        """
-        if not self.weights:
-            return
-        digest = _sha256(self.weights)
-        if self.weights_sha256 not in ("", digest):
-            raise UsageError(
-                f"{self.weights} has the sha256 {digest}, and weights_sha256 states {self.weights_sha256}. Give the file "
-                f"that was used before, or leave weights_sha256 out."
-            )
+        """Compute the digest of the weights, which is part of the key. Raises the errors of `pin_file`."""
+        digest = pin_file("weights", self.weights, self.weights_sha256)
         object.__setattr__(self, "weights_sha256", digest)
 
 
@@ -436,13 +468,3 @@ def _feature_fields(count: int) -> list[pa.Field]:
         )
         for number in range(1, count + 1)
     ]
-
-
-def _sha256(path: str) -> str:
-    """Return the sha256 of a file. Raises `UsageError` if it cannot be read."""
-    try:
-        return file_digest(Path(path)).removeprefix("sha256:")
-    except OSError as error:
-        raise UsageError(
-            f"The weights {path} cannot be read: {error.strerror}. Give a file of this computer."
-        ) from error

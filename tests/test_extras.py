@@ -11,11 +11,13 @@ from importlib.metadata import Distribution
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tacpipe.cli import commands
 from tacpipe.errors import MissingModuleError
 from tacpipe.plugins import extras, registry
+from tacpipe.video.gel_map import GelMap
 from tests import without_extras
 from tests.clouds import shapes
 from tests.commands import run as run_all
@@ -101,6 +103,8 @@ LACK = {  # Commands that need an extra, with that extra.
     "simulate gel --trials 1 --duration-s 4 -o {o}": "video",
     "extract difference data/gels -o {o}": "video",
     "extract markers data/gels -o {o}": "video",
+    "extract gel-map data/gels --streams gel0 --mm-per-px 0.06 --diameter-mm 6 -o {o}": "video",
+    "extract depth data/gels --map gel_map.npz -o {o}": "video",
     "extract autoencoder data/gels --split data/gels-split -o {o}": "learn",
     "extract encoder data/gels --weights bottle.ply -o {o}": "learn",
     "ingest table workbooks --guess": "xlsx",
@@ -165,6 +169,9 @@ def prepare(folder: Path) -> None:
     slide_files.write_roboskin(folder / "roboskin", slide_files.touched())
     grasp_files.write_grasp(folder / "grasps")
     video_files.write_gelsight(folder / "gels")
+    untouched, weights = np.ones((120, 160, 3)), np.zeros((9, 10, 2))
+    gel_map = GelMap(320, 240, 0.06, untouched, weights, np.ones((120, 160), bool), 0.5, 0.4)
+    (folder / "gel_map.npz").write_bytes(gel_map.to_bytes())
     run_all(
         folder,
         (

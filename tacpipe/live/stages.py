@@ -20,6 +20,7 @@ from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.synchronization.placement import are_arrivals, equal_fraction
 from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChannels, MarkerChannels
+from tacpipe.video.depth import DepthChannels
 from tacpipe.video.stream import read_format
 
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
@@ -32,6 +33,7 @@ CHANNELS: Mapping[str, Callable[[Any, str], FrameChannels]] = {
     "extract.markers": lambda params, place: MarkerChannels(
         params.rows, params.columns, params.pitch_mm, params.reference_frames, params.polarity, place
     ),
+    "extract.depth": DepthChannels.from_params,
 }  # channels by stage, of its params and the name of the stream
 
 

@@ -79,7 +79,7 @@ def damaged_frames(video_format: VideoFormat, batches: Iterable[pa.Table], suspe
     return damaged
 
 
-def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
+def cell_means(image: Bytes | Floats, rows: int, columns: int) -> Floats:
     """Return the mean of each cell and colour (row, column, colour) of an image (height, width, colour).
 
     Cells differ by a pixel if the height or width is not divisible.
@@ -90,8 +90,11 @@ def cell_means(image: Bytes, rows: int, columns: int) -> Floats:
     height, width, _ = image.shape
     tops = np.arange(rows) * height // rows
     lefts = np.arange(columns) * width // columns
-    row_sums = np.add.reduceat(image, tops, axis=0, dtype=np.uint32)  # (row, width, colour), below 2^32
-    sums = np.add.reduceat(row_sums, lefts, axis=1, dtype=np.int64)
+    kinds = (
+        (np.uint32, np.int64) if image.dtype == np.uint8 else (np.float64, np.float64)
+    )  # sums of rows are below 2^32
+    row_sums = np.add.reduceat(image, tops, axis=0, dtype=kinds[0])  # (row, width, colour)
+    sums = np.add.reduceat(row_sums, lefts, axis=1, dtype=kinds[1])
     areas = np.outer(np.diff([*tops, height]), np.diff([*lefts, width]))  # (row, column)
     means: Floats = sums / areas[:, :, None]
     return means

@@ -199,6 +199,13 @@ def _ingest(name: str) -> Case:
     return Case(f"ingest.{name}", command, sources=lambda lab: _publish(name, lab / "src"), durable=True)
 
 
+def _publish_balls(lab: Path) -> None:
+    """Write presses of balls into a gel."""
+    from tests.video import balls
+
+    balls.write_presses(lab / "src")
+
+
 def _publish(name: str, place: Path) -> None:
     """Write recordings in a published format."""
     from tests.formats import grasp_files, slide_files, video_files, xela_files
@@ -249,6 +256,8 @@ GELS = (
     "extract autoencoder data/g --split data/gs -o data/f --streams gel1 --images 40 --components 4 --epochs 2",
     "extract encoder data/g --streams gel1 --weights data/f/encoder.safetensors -o data/e",
 )
+BALLS = "ingest table src/presses --layout src/layout.toml -o data/presses"
+GEL_MAP = "extract gel-map data/presses --background src/background.png --mm-per-px 0.25 -o data/gel"
 STAGES = (
     *_cases_of_chain("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),
     *_cases_of_chain("forward", {3: "split", 4: "train.forward", 5: "evaluate"}),
@@ -265,6 +274,18 @@ STAGES = (
         "extract markers data/gels -o data/m --rows 2 --columns 3",
         ("ingest gelsight-slip src -o data/gels",),
         sources=lambda lab: _publish("markers", lab / "src"),
+    ),
+    Case(
+        "extract.gel-map",
+        GEL_MAP,
+        (BALLS,),
+        sources=_publish_balls,
+    ),
+    Case(
+        "extract.depth",
+        "extract depth data/presses --map data/gel --reference-frames 0 -o data/depth",
+        (BALLS, GEL_MAP),
+        sources=_publish_balls,
     ),
     Case(
         "extract.difference",
