@@ -203,7 +203,7 @@ def _publish_balls(lab: Path) -> None:
     """Write presses of balls into a gel."""
     from tests.video import balls
 
-    balls.write_presses(lab / "src")
+    balls.write_presses(lab / "src", count=4)
 
 
 def _publish(name: str, place: Path) -> None:

@@ -81,9 +81,9 @@ def write_png(path: Path, pixels: Bytes) -> None:
     path.write_bytes(b"".join(bytes(packet) for packet in packets))
 
 
-def write_presses(folder: Path) -> None:
-    """Write a press of each ball at each of `PLACES`, the background, and the layout file."""
-    for trial, (x, y, diameter_mm) in enumerate(PLACES):
+def write_presses(folder: Path, count: int = len(PLACES)) -> None:
+    """Write presses at the first ``count`` of `PLACES`, the background, and the layout file."""
+    for trial, (x, y, diameter_mm) in enumerate(PLACES[:count]):
         write_png(folder / f"presses/{diameter_mm}mm/{trial:02d}/gel.png", image(x, y, diameter_mm, seed=trial))
     write_png(folder / "background.png", background().round().astype(np.uint8))
     (folder / "layout.toml").write_text(LAYOUT)
