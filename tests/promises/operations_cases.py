@@ -200,10 +200,11 @@ def _ingest(name: str) -> Case:
 
 
 def _publish_balls(lab: Path) -> None:
-    """Write presses of balls into a gel."""
+    """Write presses of balls into a gel, and one press of its own."""
     from tests.video import balls
 
     balls.write_presses(lab / "src", count=4)
+    balls.write_presses(lab / "one", count=1)
 
 
 def _publish(name: str, place: Path) -> None:
@@ -283,8 +284,8 @@ STAGES = (
     ),
     Case(
         "extract.depth",
-        "extract depth data/presses --map data/gel --reference-frames 0 -o data/depth",
-        (BALLS, GEL_MAP),
+        "extract depth data/one --map data/gel --reference-frames 0 -o data/depth",
+        (BALLS, GEL_MAP, BALLS.replace("src/presses", "one/presses").replace("data/presses", "data/one")),
         sources=_publish_balls,
     ),
     Case(
