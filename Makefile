@@ -54,10 +54,13 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-paged test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits broken-data fuzz test-kernel check lint types bless bench clean
+.PHONY: help help-all demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-paged test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits broken-data fuzz test-kernel check lint types bless bench clean
 
-help: ## show the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+help: ## show the targets that people use
+	@grep -E '^[a-z-]+:.* ## ' $(MAKEFILE_LIST) | sed -E 's/:.* ## /\t/' | expand -t 16
+
+help-all: ## show all targets, those of maintainers too
+	@grep -E '^[a-z-]+:.* #[#-] ' $(MAKEFILE_LIST) | sed -E 's/:.* #[#-] /\t/' | expand -t 20
 
 demo: $(VENV)/.learn ## run the main job on simulated recordings, ending with demo/report.html
 	@$(BIN)/tacpipe demo -o demo
@@ -69,19 +72,19 @@ docs: $(VENV)/.docs ## build the documentation as a site into .cache/site
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo .cache/site/index.html
 
-pictures: demo ## draw the pictures of the documentation, that of the front page from the demo's report
+pictures: demo #- draw the pictures of the documentation, that of the front page from the demo's report
 	@$(BIN)/python docs/pictures.py demo/report.html
 
-result-pages: $(VENV)/.dev ## compute the three result pages of a release from the published sets in DATA, in hours; dist/results
+result-pages: $(VENV)/.dev #- compute the three result pages of a release from the published sets in DATA, in hours; dist/results
 	@$(BIN)/python docs/result_pages.py $(DATA)
 
-learning-curve: $(VENV)/.dev ## measure what more recordings are worth to forward, on the dataset of segments DATA; OPTIONS="--draws 2"; minutes to hours
+learning-curve: $(VENV)/.dev #- measure what more recordings are worth to forward, on the dataset of segments DATA; OPTIONS="--draws 2"; minutes to hours
 	@$(BIN)/python docs/learning_curve.py $(DATA) $(OPTIONS)
 
-touch-uncertainty: $(VENV)/.dev ## measure quantiles of predicted touch on the published grasps in DATA; a table
+touch-uncertainty: $(VENV)/.dev #- measure quantiles of predicted touch on the published grasps in DATA; a table
 	@$(BIN)/python docs/touch_uncertainty.py $(DATA)
 
-unknown-materials: $(VENV)/.dev ## measure the answer unknown with materials left out, on the published slides in DATA; a table
+unknown-materials: $(VENV)/.dev #- measure the answer unknown with materials left out, on the published slides in DATA; a table
 	@$(BIN)/python docs/unknown_materials.py $(DATA)
 
 rig-demo: $(VENV)/.dev ## replay simulated trials as the first paper's rig, record it live for 30 s, then the chain to a forecast
@@ -96,81 +99,81 @@ test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: som
 test-long: $(VENV)/.dev ## run the tests that take long: training, kills and crowds, DVC's chains, the docs' commands
 	@$(PYTEST) -m "long and not faults"
 
-language: $(VENV)/.dev ## print words, names and comments that plainer language may replace; it is advice
+language: $(VENV)/.dev #- print words, names and comments that plainer language may replace; it is advice
 	@$(BIN)/python tests/language.py
 
 test-rig: $(VENV)/.dev ## run the tests that emulate devices in real time
 	@$(PYTEST) -m "rig and not faults"
 
-test-ci: $(VENV)/.dev ## run the tests of all three in one go; FAULTS=2/10 adds a part of test-faults
+test-ci: $(VENV)/.dev #- run the tests of all three in one go; FAULTS=2/10 adds a part of test-faults
 	@$(if $(FAULTS),$(exhaustive))
 	@$(COUNTED) $(if $(FAULTS),--faults $(FAULTS),-m "not faults")
 	@$(if $(FAULTS),$(COUNTED) -n 0 --hypothesis-profile=faults --every $(FAULTS) $(PROPERTIES))
 	@$(if $(FAULTS),$(BIN)/python -m tests.promises.counts $(COUNTS))
 
-test-loaded: $(VENV)/.dev ## run those of `test` and `test-rig` while eight other processes keep the computer busy
+test-loaded: $(VENV)/.dev #- run those of `test` and `test-rig` while eight other processes keep the computer busy
 	@if ! command -v stress-ng > /dev/null; then $(call debian,stress-ng); fi
 	@stress-ng --cpu 8 --quiet & load=$$!; trap 'kill $$load' EXIT; $(PYTEST) -m "not faults and not long"
 
-test-faults: $(VENV)/.dev ## try faults, kills and hostile input exhaustively, in some 25 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
+test-faults: $(VENV)/.dev #- try faults, kills and hostile input exhaustively, in some 25 minutes; EVERY=20 tries one of 20, EVERY=3/20 another one; CALLS=1 all of each stage
 	@$(exhaustive)
 	@$(EXHAUSTIVE) tests/promises
 	@$(EXHAUSTIVE) --hypothesis-profile=faults $(PROPERTIES)
 	@$(EXHAUSTIVE) -m faults --ignore=tests/promises $(PROPERTIES:%=--ignore=%)
 	@$(BIN)/python -m tests.promises.counts $(COUNTS)
 
-test-paged: $(VENV)/.dev ## run the tests of stores and datasets with every dataset of two recordings or more divided into pages
+test-paged: $(VENV)/.dev #- run the tests of stores and datasets with every dataset of two recordings or more divided into pages
 	@PYTHONPATH=tests/paged $(PYTEST) -m "not faults and not long and not rig and not inline" $(PAGED)
 
-test-slurm: $(VENV)/.dev ## start Slurm on this computer, as root, and put the questions of all executors to its jobs
+test-slurm: $(VENV)/.dev #- start Slurm on this computer, as root, and put the questions of all executors to its jobs
 	@if ! command -v slurmctld > /dev/null; then $(call debian,$(SLURM)); fi
 	@$(PYTEST) tests/executors -k slurm
 
-test-exits: $(VENV)/.dev ## run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes
+test-exits: $(VENV)/.dev #- run 2,000 times `tacpipe show` and other commands that end after reading Parquet, and count exit codes
 	@$(BIN)/python -m tests.promises.exits
 
-fuzz: $(VENV)/.fuzz ## let atheris look for bytes that a reader stumbles over: make fuzz SECONDS=60 TARGETS="pcd sensor"
+fuzz: $(VENV)/.fuzz #- let atheris look for bytes that a reader stumbles over: make fuzz SECONDS=60 TARGETS="pcd sensor"
 	@OMP_NUM_THREADS=1 $(BIN)/python -m fuzz --seconds $(SECONDS) $(TARGETS)
 
-test-kernel: $(VENV)/.dev ## run the tests of HID on Debian's kernel in a virtual machine, which takes a minute
+test-kernel: $(VENV)/.dev #- run the tests of HID on Debian's kernel in a virtual machine, which takes a minute
 	@if ! command -v qemu-system-x86_64 > /dev/null || ! dpkg -s busybox-static > /dev/null 2>&1; then \
 	    $(call debian,$(VIRTUAL_MACHINE)); \
 	fi
 	@OMP_NUM_THREADS=1 TACPIPE_TEST_KERNEL=1 $(BIN)/pytest -q -s tests/kernel
 
-test-exports: $(VENV)/.dev ## have LeRobot's loader, datasets and mlcroissant open exports, in an environment of their own (0.5 GB)
+test-exports: $(VENV)/.dev #- have LeRobot's loader, datasets and mlcroissant open exports, in an environment of their own (0.5 GB)
 	@if [ ! -e .cache/exports/bin/.made ]; then \
 	    $(BIN)/python -m tests.exports.environment .cache/exports && touch .cache/exports/bin/.made; \
 	fi
 	@if ! command -v ffmpeg > /dev/null; then $(call debian,ffmpeg); fi
 	@TACPIPE_EXPORTS_PYTHON=$(CURDIR)/.cache/exports/bin/python $(PYTEST) tests/exports
 
-broken-data: $(VENV)/.dev ## compare how tools read inputs with one fault each, and write the table of the page
+broken-data: $(VENV)/.dev #- compare how tools read inputs with one fault each, and write the table of the page
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.broken.table
 
-test-viewer: $(VENV)/.dev ## have Rerun's own reader open what `tacpipe view` writes, in an environment of its own (0.5 GB)
+test-viewer: $(VENV)/.dev #- have Rerun's own reader open what `tacpipe view` writes, in an environment of its own (0.5 GB)
 	@if [ ! -e .cache/viewer/bin/.made ]; then \
 	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
 	fi
 	@OMP_NUM_THREADS=1 .cache/viewer/bin/python -m pytest -q tests/viewer
 
-viewer-pictures: $(VENV)/.dev ## take the pictures of the viewer in the documentation, under a virtual screen (Xvfb)
+viewer-pictures: $(VENV)/.dev #- take the pictures of the viewer in the documentation, under a virtual screen (Xvfb)
 	@if [ ! -e .cache/viewer/bin/.made ]; then \
 	    $(BIN)/python -m tests.viewer.environment .cache/viewer && touch .cache/viewer/bin/.made; \
 	fi
 	@if ! command -v Xvfb > /dev/null; then $(call debian,$(SCREEN)); fi
 	@.cache/viewer/bin/python docs/viewer_pictures.py
 
-test-trackers: $(VENV)/.dev ## have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
+test-trackers: $(VENV)/.dev #- have TensorBoard, an MLflow server and W&B read what --track gives them, in an environment of their own (1 GB)
 	@if [ ! -e .cache/trackers/bin/.made ]; then \
 	    $(BIN)/python -m tests.trackers.environment .cache/trackers && touch .cache/trackers/bin/.made; \
 	fi
 	@TACPIPE_TRACKERS_PYTHON=$(CURDIR)/.cache/trackers/bin/python $(PYTEST) tests/trackers
 
-test-install: $(VENV)/.dev ## build the wheel and the sdist, install them with each extra into clean environments, and use them
+test-install: $(VENV)/.dev #- build the wheel and the sdist, install them with each extra into clean environments, and use them
 	@$(BIN)/python -m tests.packaging.environments
 
-test-power: $(VENV)/.dev ## replay a loss of power at each write on ext4, xfs and btrfs in User-mode Linux; EVERY=20 tries one of 20
+test-power: $(VENV)/.dev #- replay a loss of power at each write on ext4, xfs and btrfs in User-mode Linux; EVERY=20 tries one of 20
 	@if [ -n "$$($(BIN)/python -c 'from tests.power import machine; print(machine.lacking())')" ]; then \
 	    $(call debian,$(BLOCK_REPLAY)); \
 	fi
@@ -179,18 +182,18 @@ test-power: $(VENV)/.dev ## replay a loss of power at each write on ext4, xfs an
 check: $(VENV)/.dev ## lint and types, next to one another
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync lint types
 
-lint: $(VENV)/.dev ## check style, and that imports follow the layers
+lint: $(VENV)/.dev #- check style, and that imports follow the layers
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/lint-imports --no-logo
 
-types: $(VENV)/.dev ## check types
+types: $(VENV)/.dev #- check types
 	@$(BIN)/mypy
 
-bless: $(VENV)/.dev ## pin the golden digests of stages whose version was raised
+bless: $(VENV)/.dev #- pin the golden digests of stages whose version was raised
 	@$(BIN)/python -m tests.golden_values
 
-bench: $(VENV)/.dev ## measure CPU seconds, memory and bytes next to peers; writes benchmarks/results.md
+bench: $(VENV)/.dev #- measure CPU seconds, memory and bytes next to peers; writes benchmarks/results.md
 	@$(BIN)/python benchmarks/run.py
 
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
