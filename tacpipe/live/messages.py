@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,19 +24,21 @@ VERSION = 1
 ABSENT: frozenset[str] = frozenset()
 
 
+@dataclass
 class Message:
     """A message of any task. Subclasses are dataclasses with an attribute for each value in their `declaration`."""
 
     declaration: ClassVar[Declaration]
     seq: int
     t_ns: int  # time that the message refers to, in the recording's UTC
-    cause: str  # why there is no result, or which input is missing
-    made_from_t_ns: int  # arrival time of the newest sample used
-    latency_ms: float
-    skipped: int
-    late: int
+    _: KW_ONLY
+    cause: str = ""  # why there is no result, or which input is missing
+    made_from_t_ns: int = 0  # arrival time of the newest sample used
+    latency_ms: float = math.nan
     age_ms: float = math.nan
     compute_ms: float = math.nan
+    skipped: int = 0
+    late: int = 0
     flags: int = 0
     sent_ns: int = 0  # time of publishing, on the clock of ``t_ns``
     offset_ns: int = time.time_ns() - time.monotonic_ns()  # from the monotonic clock to that of ``t_ns``

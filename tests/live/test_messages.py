@@ -28,7 +28,7 @@ CHANNELS = tuple(f"c{number}" for number in range(5))
 
 
 def message(values: Float32s | None = VALUES) -> ForecastMessage:
-    return ForecastMessage(7, 10**18, values, "why", 4, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1)
+    return ForecastMessage(7, 10**18, values, cause="why", flags=4, age_ms=4.5, **MEASURED)
 
 
 def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> None:
@@ -142,9 +142,9 @@ def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
         7,
         T_NS,
         PUBLISHED_VALUES,
-        cause,
-        flags,
-        T_NS - 5,
+        cause=cause,
+        flags=flags,
+        made_from_t_ns=T_NS - 5,
         age_ms=4.5,
         levels=levels,
         quantiles=quantiles,
@@ -152,7 +152,7 @@ def forecasts(unit: str, levels: tuple[int, ...]) -> Case:
     )
     sizes: dict[str, Any] = {"channels": ("a", "b"), "steps": (1, 3), "quantiles": levels, "unit": unit}
     streams = {"forecast": Live(task="forward", output="forecast", **sizes)}
-    return about, [answer, forward.ForecastMessage(8, T_NS, None, "no", 3, levels=levels)], streams
+    return about, [answer, forward.ForecastMessage(8, T_NS, None, cause="no", flags=3, levels=levels)], streams
 
 
 def materials() -> Case:
@@ -160,7 +160,7 @@ def materials() -> Case:
     about = material.MaterialDescription(names, "skin", 50, True, "probability", 10.0, "m")
     likely = np.array([0.25, 0.75], np.float32)
     answer = material.MaterialMessage(
-        3, T_NS, names, likely, "sliding", 20, 0.41234567, "", T_NS - 5, slide=2, **MEASURED
+        3, T_NS, names, likely, "sliding", 20, 0.41234567, made_from_t_ns=T_NS - 5, slide=2, **MEASURED
     )
     none = material.MaterialMessage(4, T_NS, names, None, cause="no")
     return about, [answer, none], {"material": Live(task="material", output="material", channels=names)}
@@ -171,7 +171,9 @@ def rankings() -> Case:
     values[0, 1] = math.nan
     levels = np.array([[0.1, math.nan], [0.3, 0.44444444]])
     scores = np.array([0.1, 0.37222])
-    answer = touch.TouchMessage(3, T_NS, 12, "contact", values, levels, scores, (2, 1), "", T_NS - 5, **MEASURED)
+    answer = touch.TouchMessage(
+        3, T_NS, 12, "contact", values, levels, scores, (2, 1), made_from_t_ns=T_NS - 5, **MEASURED
+    )
     none = touch.TouchMessage(4, T_NS, 13, "contact", cause="no")
     about = touch.TouchDescription(("pdc_th", "e_th"), "contact", "m")
     return about, [answer, none], {"touch": Live(task="touch", output="touch", channels=touch.COLUMNS)}

@@ -72,16 +72,16 @@ class ForecastEngine(RowEngine[LiveChain]):
             self.next_seq(),
             row.t_ns,
             values,
-            describe_cause(row),
-            row.cause.value,
-            row.made_from_t_ns,
+            cause=describe_cause(row),
+            flags=row.cause.value,
+            made_from_t_ns=row.made_from_t_ns,
             levels=self.quantiles,
             quantiles=levels,
         )
 
     def no_answer(self, t_ns: int, cause: str) -> ForecastMessage:
         """Return a message without a forecast."""
-        return ForecastMessage(self.next_seq(), t_ns, None, cause, levels=self.quantiles)
+        return ForecastMessage(self.next_seq(), t_ns, None, cause=cause, levels=self.quantiles)
 
 
 def describe_cause(forecast: GridForecast) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -79,17 +78,7 @@ DECLARATION = Declaration(
 class ForecastMessage(messages.Message):
     """A forecast, or why there is none."""
 
-    seq: int
-    t_ns: int  # time of the grid point, UTC as in the recording
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
-    cause: str = ""  # reason why there is no forecast, or the missing input
-    flags: int = 0  # the cause as flags of `tacpipe.tasks.forward.live.chain.Cause`
-    made_from_t_ns: int = 0  # arrival of the newest sample that was read
-    latency_ms: float = math.nan
-    age_ms: float = math.nan
-    compute_ms: float = math.nan
-    skipped: int = 0
-    late: int = 0
     levels: tuple[int, ...] = ()  # levels of the published quantiles in percent
     quantiles: Float32s | None = (
         None  # (level, step, channel), if the session publishes quantiles and there is a forecast

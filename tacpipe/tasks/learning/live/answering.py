@@ -109,5 +109,5 @@ class AnswerEngine(WindowEngine):
         nothing = np.full(len(names), np.nan)
         if isinstance(self._model.answers, Quantities):
             band = np.full((2, len(names)), np.nan)
-            return EstimateMessage(self.next_seq(), t_ns, names, nothing, cause, band=band)
-        return ClassMessage(self.next_seq(), t_ns, names, nothing, cause)
+            return EstimateMessage(self.next_seq(), t_ns, names, nothing, cause=cause, band=band)
+        return ClassMessage(self.next_seq(), t_ns, names, nothing, cause=cause)

@@ -123,18 +123,8 @@ CLASSES = Declaration(
 class LearnedMessage(messages.Message):
     """What the messages of both kinds share."""
 
-    seq: int
-    t_ns: int
     names: tuple[str, ...]  # targets or classes
     values: Floats  # (name,), estimates or probabilities; NaN: none
-    cause: str = ""
-    made_from_t_ns: int = 0
-    latency_ms: float = math.nan
-    age_ms: float = math.nan
-    compute_ms: float = math.nan
-    skipped: int = 0
-    late: int = 0
-    flags: int = 0
 
     @property
     def answers(self) -> bool:

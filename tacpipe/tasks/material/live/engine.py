@@ -222,8 +222,8 @@ class MaterialEngine(RowEngine[SlidesSoFar]):
             state,
             answer.rows,
             answer.fraction,
-            answer.cause or ("" if answer.probabilities is not None else self._why),
-            row.newest_ns,
+            cause=answer.cause or ("" if answer.probabilities is not None else self._why),
+            made_from_t_ns=row.newest_ns,
             slide=row.slide,
         )
 

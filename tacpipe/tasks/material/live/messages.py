@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -70,19 +69,11 @@ DECLARATION = Declaration(
 class MaterialMessage(messages.Message):
     """The material of the slide so far, or the reason why it is unknown."""
 
-    seq: int
-    t_ns: int  # time up to which samples were read, UTC time of the recording
     names: tuple[str, ...]  # class names
     probabilities: Float32s | None  # (class,); None if no material is predicted
     state: str = WAITING  # state of the slide; final if it equals the result of `tacpipe predict`
     rows: int = 0  # number of rows of the slide so far
     seen: float = 0.0  # fraction of the model's input rows
-    cause: str = ""  # reason why no material is predicted
-    made_from_t_ns: int = 0  # arrival of the newest sample that was read
-    latency_ms: float = math.nan
-    compute_ms: float = math.nan
-    skipped: int = 0
-    late: int = 0
     slide: int = 1  # index of the slide in its recording
     declaration: ClassVar[Declaration] = DECLARATION
 

@@ -64,20 +64,10 @@ DECLARATION = Declaration(
 class SlipMessage(messages.Message):
     """The probability of a slip at one sample, or why there is none."""
 
-    seq: int
-    t_ns: int
     probability: float = math.nan
     score: float = math.nan
     alarm_state: int = UNKNOWN
     touch: Mapping[str, list[float]] = field(default_factory=dict)
-    cause: str = ""
-    made_from_t_ns: int = 0
-    latency_ms: float = math.nan
-    age_ms: float = math.nan
-    compute_ms: float = math.nan
-    skipped: int = 0
-    late: int = 0
-    flags: int = 0
     declaration: ClassVar[Declaration] = DECLARATION
 
     @property

@@ -90,20 +90,12 @@ class CandidateJson(TypedDict):
 class TouchMessage(messages.Message):
     """The ranking of a request's candidates, or the reason why it is missing."""
 
-    seq: int
-    t_ns: int  # arrival of the request, UTC time of the recording
     request: int  # request number from the client
     criterion: str
     touch: Floats | None = None  # (grasp, value) in the order of `COLUMNS`, device counts; NaN if not predicted
     levels: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # (grasp, finger)
     scores: Floats = field(default_factory=lambda: np.zeros(0))  # (grasp,)
     ranks: tuple[int, ...] = ()  # rank of each grasp, 1 for the best
-    cause: str = ""  # reason why there is no ranking
-    made_from_t_ns: int = 0
-    latency_ms: float = math.nan
-    compute_ms: float = math.nan
-    skipped: int = 0
-    late: int = 0
     declaration: ClassVar[Declaration] = DECLARATION
 
     @property
