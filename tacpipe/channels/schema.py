@@ -232,13 +232,13 @@ def stream(
 
 
 _QUANTITIES = """
-    acceleration analog angle angular_acceleration angular_velocity colour compliance count current curvature deflection
-    displacement distance external_torque finger_width fluid_pressure force friction humidity illuminance image
+    acceleration analog angle angular_acceleration angular_velocity area colour compliance count current curvature
+    deflection displacement distance external_torque finger_width fluid_pressure force friction humidity illuminance image
     joint_acceleration joint_position joint_torque joint_velocity label latent length magnetic_field magnetic_flux_density
     mask mass orientation plan position power prediction probability proximity range resistance score sequence share
     signal_strength speed state static_pressure status strain tactile target_current target_joint_acceleration
     target_joint_position target_joint_torque target_joint_velocity target_orientation target_position target_velocity
-    temperature temperature_change text time torque velocity vibration voltage
+    temperature temperature_change text time torque velocity vibration voltage volume
 """
 QUANTITIES = frozenset(_QUANTITIES.split())
 _PREFIXED = "m g s A K N Pa V W J Hz T G F C H S ohm Ω rad l L bar B eV"  # units with SI prefixes
