@@ -136,12 +136,14 @@ def _read_press(params: Params, recording: Recording, background: Bytes | None) 
         )
     grid = grid_shape(video_format.height_px, video_format.width_px)
     untouched_gel = UntouchedGel(params.reference_frames, f"Recording {recording.name}, stream {stream}")
-    change, untouched, sound = np.zeros((*grid, 3)), np.zeros(0), 0
+    untouched = np.zeros(0) if background is None else cell_means(background, *grid)
+    change, sound = np.zeros((*grid, 3)), 0
     for _, image in decode_frames(video_format, read_batches(columns)):
         if image is None:
             continue
         means = cell_means(image, *grid)
-        untouched = untouched_gel.update(means) if background is None else cell_means(background, *grid)
+        if background is None:
+            untouched = untouched_gel.update(means)
         change = max(change, relative_change(means, untouched), key=lambda part: float(np.abs(part).mean()))
         sound += 1
     count_rows(recording.name, stream, RowCounts.some_used(columns.num_rows, sound, "damaged"))

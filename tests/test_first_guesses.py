@@ -1,4 +1,4 @@
-"""What people type before they read works, or the error names what does it."""
+"""Test words that people type before they read: they work, or the error names what does the same."""
 
 from collections.abc import Callable
 from typing import Any

@@ -28,7 +28,7 @@ from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.synchronization.causal import Grid, GridRows, StreamColumns
+from tacpipe.synchronization.causal import Grid, StreamColumns
 from tacpipe.synchronization.placement import Placement
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ EVERY_NS = 1_000_000  # time between two checks for new samples
 IDLE_NS = 5_000_000  # the same while no recording is running
 EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
 LITTLE_NS = 300_000  # minimum wait for which the process sleeps instead of polling
-# Until the levels at rest are known, rows wait this long for samples that other threads have read but not passed yet: one
-# that is missing would change the level of the whole session.
+# Until the levels at rest are known, rows wait this long for samples that other threads have read but not passed yet. A
+# missing sample would change the level of the whole session.
 RESTING_NS = 250_000_000
 PERIODS = 2.0  # periods without a row after which a message reports the cause
 SLACK_NS = 5_000_000  # additional time that is allowed for jitter
@@ -69,6 +69,9 @@ class RowSource(Protocol):
 
     def push(self, stream: str, samples: Any) -> None:
         """Add samples of a stream, `BatchColumns` or a table, in the order of arrival."""
+
+    def advance(self, until_ns: int) -> Sequence[Any]:
+        """Return the new rows up to a time, up to which all samples were pushed."""
 
     def take_over(self, previous: Any) -> None:
         """Take what earlier rows of the session know beside their beginning, such as plans."""
@@ -187,9 +190,9 @@ class RowEngine(Engine, Generic[R]):
         if self.running and message.answers and master is not None and master.heard_ns is not None:
             message.age_ms = (now_ns - master.heard_ns) / 1e6
 
-    @abstractmethod
     def advance(self, until_ns: int) -> Sequence[Any]:
-        """Return the rows up to a time, up to which all samples were pushed."""
+        """Return the new rows up to a time, up to which all samples were pushed."""
+        return self.rows.advance(until_ns)
 
     @abstractmethod
     def message(self, row: Any) -> Message:
@@ -274,11 +277,11 @@ class SynchronizedRows:
                 f"The rows of the model are those of the stream {master}, and there are {listed(schemas)}."
             )
         self.columns = columns
-        self.widths = {
+        widths = {
             name: StreamColumns.from_schema(schemas[name], names, synchronize, is_master=name == master)
             for name, names in columns.items()
         }
-        self.grid = Grid(self.widths, master, synchronize.timeline, synchronize.rate_hz, gap_ns, origin_ns)
+        self.grid = Grid(widths, master, synchronize.timeline, synchronize.rate_hz, gap_ns, origin_ns)
         self._arrivals = set(arrivals)
         self._placements: dict[str, Placement] = {}
         self._reader = ColumnReader()
@@ -293,10 +296,6 @@ class SynchronizedRows:
             placement = self._placements[stream] = Placement(samples.schema, arrivals=is_arrival)
         times = {name: read_times(samples, name) for name in placement.columns}
         self.grid.push(stream, *placement.place(times), self._reader.read(stream, samples, self.columns[stream]))
-
-    def rows(self, until_ns: int) -> GridRows:
-        """Return the new rows up to a time, up to which all samples were pushed."""
-        return self.grid.rows(until_ns)
 
 
 class ColumnReader:

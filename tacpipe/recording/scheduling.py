@@ -21,7 +21,7 @@ def check_realtime() -> None:
         _set(0, RECORDER)
     except (OSError, AttributeError) as error:
         raise UsageError(
-            f"--realtime: real-time scheduling is not allowed here ({error}). Run the session as root, or have "
+            f"--realtime: real-time scheduling is not allowed here ({error}). Run the command as root, or have "
             f"`@realtime - rtprio {RECORDER}` in /etc/security/limits.d and this user in that group; or leave it out."
         ) from error
     ordinary()

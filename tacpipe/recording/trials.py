@@ -49,7 +49,7 @@ class RecordingPlan:
     keep_spool: bool = False
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     pictures: int | None = None  # port at which a browser sees the cameras
-    realtime: bool = False  # whether recordings run before ordinary programs
+    realtime: bool = False  # true to run recordings before ordinary programs
 
     @property
     def has_end(self) -> bool:

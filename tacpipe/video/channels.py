@@ -83,7 +83,7 @@ class DifferenceChannels:
             pa.field(
                 f"taxel{row:02d}{column:02d}_{colour}",
                 pa.float32(),
-                metadata={"unit": "count", **_place(row, column, self._columns), "component": colour},
+                metadata={"unit": "count", **cell_metadata(row, column, self._columns), "component": colour},
             )
             for row, column, colour in product(range(1, self._rows + 1), range(1, self._columns + 1), COLOURS)
         ]
@@ -123,7 +123,7 @@ class MarkerChannels:
             pa.field(
                 f"taxel{row:02d}{column:02d}_{axis}",
                 pa.float32(),
-                metadata={"unit": unit, **_place(row, column, self._columns), "axis": axis},
+                metadata={"unit": unit, **cell_metadata(row, column, self._columns), "axis": axis},
             )
             for row, column, axis in product(range(1, self._rows + 1), range(1, self._columns + 1), ("x", "y"))
         ]
@@ -178,7 +178,7 @@ def _describe_failure(search: GridSearch) -> str:
     )
 
 
-def _place(row: int, column: int, columns: int) -> dict[str, str]:
+def cell_metadata(row: int, column: int, columns: int) -> dict[str, str]:
     """Return the metadata of a tactile channel in a grid cell; rows and columns start at 1."""
     return {"quantity": "tactile", "row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)}
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Bytes, Floats
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.video.channels import UntouchedGel
+from tacpipe.video.channels import UntouchedGel, cell_metadata
 from tacpipe.video.decoding import cell_means
 from tacpipe.video.gel_map import GelMap, map_path, read_map, relative_change
 
@@ -113,10 +113,7 @@ class DepthChannels:
             pa.field(
                 f"taxel{row:02d}{column:02d}",
                 pa.float32(),
-                metadata={
-                    **{"unit": "mm", "quantity": "tactile", "component": "depth"},
-                    **{"row": str(row), "column": str(column), "taxel": str((row - 1) * columns + column)},
-                },
+                metadata={"unit": "mm", **cell_metadata(row, column, columns), "component": "depth"},
             )
             for row, column in product(range(1, rows + 1), range(1, columns + 1))
         ]

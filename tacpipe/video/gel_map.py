@@ -57,6 +57,18 @@ def place_terms(rows: int, columns: int) -> Floats:
     return np.stack([x**along * y**down for along, down in powers], axis=-1)
 
 
+def cell_coefficients(shape: tuple[int, ...], weights: Floats) -> Floats:
+    """Return the weight of each colour term in each cell (row, column, colour term, xy) of a grid with this shape."""
+    coefficients: Floats = np.tensordot(place_terms(*shape[:2]), weights, axes=(2, 1))
+    return coefficients
+
+
+def polynomial_normals(change: Floats, coefficients: Floats) -> Floats:
+    """Return normals (row, column, xy) for a relative change (row, column, colour), without limits."""
+    normals: Floats = np.einsum("rct,rctk->rck", colour_terms(change), coefficients)
+    return normals
+
+
 @dataclass(frozen=True)
 class GelMap:
     """The slope of a gel by relative colour change and place, as fitted to presses of balls."""
@@ -80,8 +92,7 @@ class GelMap:
     @cached_property
     def coefficients(self) -> Floats:
         """The weight of each colour term in each cell (row, column, colour term, xy)."""
-        coefficients: Floats = np.tensordot(place_terms(*self.background.shape[:2]), self.weights, axes=(2, 1))
-        return coefficients
+        return cell_coefficients(self.background.shape, self.weights)
 
     def normals(self, change: Floats) -> tuple[Floats, Bools]:
         """Return normals (row, column, xy) for the relative change (row, column, colour), and whether each is a guess.
@@ -90,7 +101,7 @@ class GelMap:
         slope. Sines beyond ``max_sine`` are limited to it. The result is a guess (row, column) there, and where no ball
         touched the gel.
         """
-        normals = np.einsum("rct,rctk->rck", colour_terms(change), self.coefficients)
+        normals = polynomial_normals(change, self.coefficients)
         sines = np.linalg.norm(normals, axis=-1)
         limited: Floats = normals * (self.max_sine / np.maximum(sines, self.max_sine))[..., None]
         return limited, (sines > self.max_sine) | ~self.is_covered

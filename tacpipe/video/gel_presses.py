@@ -16,7 +16,14 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats
 from tacpipe.errors import TacpipeError
 from tacpipe.video.depth import depth_from_normals
-from tacpipe.video.gel_map import COLOUR_COUNTS, PLACE_COUNTS, colour_terms, place_terms
+from tacpipe.video.gel_map import (
+    COLOUR_COUNTS,
+    PLACE_COUNTS,
+    cell_coefficients,
+    colour_terms,
+    place_terms,
+    polynomial_normals,
+)
 
 # radii, as fractions of a circle's, at which slopes are compared: halfway, at the rim, and outside
 INSIDE, RIM, OUTSIDE = (0.55, 0.65, 0.75), (0.9, 0.97, 1.04), (1.25, 1.35, 1.45)
@@ -61,7 +68,7 @@ class GelFit:
     is_covered: Bools  # (row, column)
     max_sine: float
     rim_ratio: float  # median over the presses
-    circles: Mapping[str, Floats]  # x, y and radius of the contact in cells, by press
+    circles: Mapping[str, Floats]  # contact of each press: x, y and radius in cells
     errors: Mapping[str, PressError]  # by press
     refused: Mapping[str, str]  # reason by press without a contact of its ball
 
@@ -171,10 +178,7 @@ def _is_inside(change: Floats, circle: Floats, fraction: float = 1.0) -> Bools:
 
 def _predict(change: Floats, weights: Floats) -> Floats:
     """Return the normals (row, column, xy) of a map without limits."""
-    places = place_terms(*change.shape[:2])
-    coefficients = np.tensordot(places, weights, axes=(2, 1))  # (row, column, colour term, xy)
-    normals: Floats = np.einsum("rct,rctk->rck", colour_terms(change), coefficients)
-    return normals
+    return polynomial_normals(change, cell_coefficients(change.shape, weights))
 
 
 def _centre(press: Press, weights: Floats, circle: Floats, cell_mm: float) -> Floats:

@@ -108,7 +108,7 @@ def disturbed(image: Bytes, kind: Disturbance, area: tuple[int, int, int, int], 
     changed = image.copy()
     part = changed[top:bottom, left:right]
     y, x = np.indices(part.shape)
-    if kind == "noise":  # of the complete image
+    if kind == "noise":  # it covers the complete image
         return rng.integers(0, 256, image.shape).astype(np.uint8)
     if kind == "glare":
         spot = 400 * np.exp(-((x - part.shape[1] / 2) ** 2 + (y - part.shape[0] / 2) ** 2) / (2 * 30.0**2))

@@ -130,7 +130,7 @@ class LiveWindows(ABC):
         return
 
     @abstractmethod
-    def rows(self, until_ns: int) -> list[LiveRow]:
+    def advance(self, until_ns: int) -> list[LiveRow]:
         """Return the rows up to a time; all samples up to then must have been pushed."""
 
     def _row(self, t_ns: int, arrival_ns: int) -> LiveRow:
@@ -174,7 +174,7 @@ class RecordedWindows(LiveWindows):
         if stream == self.master:
             self._pending.extend(t_ns.tolist())
 
-    def rows(self, until_ns: int) -> list[LiveRow]:
+    def advance(self, until_ns: int) -> list[LiveRow]:
         """Return the rows up to a time."""
         due = []
         while self._pending and self._pending[0] <= until_ns:
@@ -226,9 +226,9 @@ class SynchronizedWindows(LiveWindows):
         """Add samples of a stream in the order of arrival."""
         self._synchronized.push(stream, samples)
 
-    def rows(self, until_ns: int) -> list[LiveRow]:
+    def advance(self, until_ns: int) -> list[LiveRow]:
         """Return the rows up to a time."""
-        grid = self._synchronized.rows(until_ns)
+        grid = self._synchronized.grid.rows(until_ns)
         kept = np.flatnonzero(grid.has_samples)
         if not len(kept):
             return []
@@ -242,10 +242,6 @@ class SynchronizedWindows(LiveWindows):
 
 class WindowEngine(RowEngine[LiveWindows]):
     """A live session with a model that answers windows, one answer per row. A task adds the message."""
-
-    def advance(self, until_ns: int) -> Sequence[LiveRow]:
-        """Return the rows up to a time."""
-        return self.rows.rows(until_ns)
 
     def message(self, row: LiveRow) -> Message:
         """Return the message for a row, with a cause if a window is not full."""
@@ -264,7 +260,7 @@ def replayed(windows: LiveWindows, tables: Mapping[str, pa.Table]) -> Iterator[L
     for until_ns, pieces in pieces_by_arrival(read, windows.master):
         for name, piece in pieces.items():
             windows.push(name, piece)
-        yield from windows.rows(until_ns)
+        yield from windows.advance(until_ns)
 
 
 def _recorded_names(stream: InputStream, schemas: Mapping[str, pa.Schema]) -> list[str]:

@@ -75,7 +75,7 @@ class SlidesSoFar:
     def take_over(self, previous: SlidesSoFar) -> None:
         """Take nothing: the samples of earlier rows have a gap."""
 
-    def until(self, until_ns: int | None) -> list[SlideRow]:
+    def advance(self, until_ns: int | None) -> list[SlideRow]:
         """Return the final rows of slides that ended by a time, and the row of the current slide.
 
         None is the end of the recording, where that row is final as well.
@@ -198,13 +198,9 @@ class MaterialEngine(RowEngine[SlidesSoFar]):
         for name, decoder in self._decoders.items():
             for batch in decoder.last():
                 self.rows.push(name, decoder.columns(batch, self._offset_ns))
-        messages = self._messages(self.rows.until(None), time.perf_counter())
+        messages = self._messages(self.rows.advance(None), time.perf_counter())
         self._offset_ns = None
         return messages
-
-    def advance(self, until_ns: int) -> Sequence[SlideRow]:
-        """Return the rows of slides that ended by a time, and of the current slide."""
-        return self.rows.until(until_ns)
 
     def message(self, row: SlideRow) -> MaterialMessage:
         """Return the message for the slide's samples up to a time."""
