@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tacpipe.engine.executors.local import Local
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Cluster
 from tests.promises.counts import count
@@ -96,3 +97,12 @@ def test_after_a_kill_of_any_of_them_the_result_is_that_of_one_process(lab: Lab,
     assert [recording["shards"] for recording in lab.manifest("data/out").recordings.values()] == expected
     assert os.path.exists(lab.folder / "data/out/manifest.json")  # noqa: PTH110
     count("workers, schedulers and commands killed")
+
+
+def test_workers_have_the_environment_that_their_caller_has_when_they_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["TACPIPE_OWN", "HOME"] * 4
+    for value in ("one", "two"):
+        monkeypatch.setenv("TACPIPE_OWN", value)
+        assert set(Local(2).run(os.getenv, names, ())) == {value, os.environ["HOME"]}
+    monkeypatch.delenv("TACPIPE_OWN")
+    assert set(Local(2).run(os.getenv, names, ())) == {None, os.environ["HOME"]}

@@ -186,19 +186,25 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
 def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connection]) -> None:
     """Start ``jobs`` workers. Adds the connection to each, and the one that keeps it alive, to ``workers``."""
     server = start_fork_server(preload)
+    environment = {**os.environ, SAFE_PATH: "1"}  # the server keeps the environment in which it started
     for number in range(jobs):
         ours, theirs = server.Pipe()
         alive, life = server.Pipe(duplex=False)
         workers[ours] = life
         # otherwise, a worker that received half of a task would report an error
         with termination.deferred(), _explain_death(), without_main():
-            server.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
+            variables = environment | devices.gpu_for(number)
+            server.Process(target=_work, args=(theirs, alive, variables)).start()
         theirs.close()
         alive.close()
 
 
 def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> None:
-    """Compute the tasks that arrive over ``tasks`` while the process at the other end of ``alive`` lives."""
+    """Compute the tasks that arrive over ``tasks`` while the process at the other end of ``alive`` lives.
+
+    ``variables`` replace the environment.
+    """
+    os.environ.clear()
     os.environ.update(variables)
     termination.end_with(alive.fileno())
     while True:
