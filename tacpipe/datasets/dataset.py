@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.arrays import Arrays, Tensors
     from tacpipe.datasets.lineage import CountedRows
+    from tacpipe.datasets.window_images import Transform
     from tacpipe.datasets.windows import Windows
     from tacpipe.io.columns import Columns
 
@@ -454,6 +455,12 @@ class Dataset:
         scale: bool | Windows = False,
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
+        images: Sequence[str] = (),
+        cameras: Dataset | None = None,
+        size: int | tuple[int, int] | None = None,
+        roi: tuple[int, int, int, int] | None = None,
+        difference: bool = False,
+        transform: Transform | None = None,
     ) -> Windows:
         """Return the windows of all recordings as a map-style torch dataset; see `tacpipe.datasets.windows.Windows`.
 
@@ -464,8 +471,16 @@ class Dataset:
         ``rest_s`` subtracts from each tactile channel its level at rest, the median over the first ``rest_s`` seconds
         of the recording. ``scale`` subtracts each channel's mean and divides by its standard deviation, computed from
         these windows (True) or taken from others, such as the training windows.
+
+        ``images`` names streams of frames. Each window then has the newest frame of each camera at its past rows, and
+        rows without a sound frame that is at most three steps old are in no window. The streams are those of the
+        recordings, or else of the recordings with the same names in ``cameras``. ``roi`` (left, top, width, height) is
+        the part of a frame in pixels, and ``size`` the side of the image, or its height and width. ``difference``
+        subtracts the mean of the first five frames, which must show the untouched gel; rows before the fifth are in no
+        window. ``transform`` is applied to the images (context, 3, height, width) of a camera.
         """
         with extras.explain_missing("windows"):
+            from tacpipe.datasets.window_images import ImageOptions
             from tacpipe.datasets.windows import Windows
 
         return Windows(
@@ -480,6 +495,7 @@ class Dataset:
             scale=scale,
             stride=stride,
             dtype=dtype,
+            images=ImageOptions(tuple(images), cameras or self, size, roi, difference, transform) if images else None,
         )
 
     def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Arrays]:

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import IO, TYPE_CHECKING, Literal, NamedTuple, TypedDict
+from typing import IO, TYPE_CHECKING, Literal, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 import torch
@@ -15,8 +15,10 @@ import torch
 from tacpipe.arrays import AnyArray, Bools, Floats, Int64s
 from tacpipe.channels import streams
 from tacpipe.datasets import arrays
+from tacpipe.datasets.window_images import WindowImages
 from tacpipe.errors import UsageError
-from tacpipe.plugins.rows import IN_GAP, RowCounts, count_rows
+from tacpipe.io.row_groups import holds_bytes
+from tacpipe.plugins.rows import IN_GAP, NO_IMAGE, RowCounts, count_rows
 from tacpipe.printable import listed, plain
 from tacpipe.signals.contact import rest_level
 from tacpipe.signals.runs import rows_in_windows, run_starts, window_starts
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.reading import ReadableDataset, ReadableRecording
+    from tacpipe.datasets.window_images import ImageOptions
 
 KEPT_BYTES = 1 << 30  # maximum size of an array of decoded recordings in memory; a larger one is in a temporary file
 TACTILE = "tactile"  # quantity of the channels with a level at rest
@@ -37,6 +40,7 @@ class Window(TypedDict):
     future: torch.Tensor  # (horizon, target)
     t_ns: torch.Tensor  # int64 (context + horizon,), nanoseconds
     recording: str
+    images: NotRequired[dict[str, torch.Tensor]]  # (context, colour, height, width) by camera
 
 
 class Scaling(NamedTuple):
@@ -69,6 +73,7 @@ class _Decoded(NamedTuple):
     rows: Int64s  # (recording,), cumulative number of rows
     starts: Int64s  # (window,), first row of each window
     windows: Int64s  # (recording,), cumulative number of windows
+    images: WindowImages | None
 
 
 class _GrowingArray:
@@ -110,6 +115,7 @@ class Windows(torch.utils.data.Dataset[Window]):
     ``future``     the same type, ``(horizon, target)``
     ``t_ns``       int64 ``(context + horizon,)``: times of the rows in nanoseconds
     ``recording``  the name of the recording
+    ``images``     uint8 ``(context, 3, height, width)`` by camera, if ``images`` names cameras
     =============  ==========================================================================
 
     ``inputs`` and ``targets`` name the channels of the past and of the future, ``columns`` both. The default is all
@@ -136,6 +142,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         scale: bool | Windows = False,
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
+        images: ImageOptions | None = None,
     ) -> None:
         """Prepare the windows that `Dataset.windows` describes; recordings are decoded when they are needed.
 
@@ -143,7 +150,7 @@ class Windows(torch.utils.data.Dataset[Window]):
         """
         window_starts(
             np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride
-        )  # raises an error for lengths below 1
+        )  # raises an error for wrong lengths
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
         if columns is not None and not (inputs is None and targets is None):
@@ -152,6 +159,7 @@ class Windows(torch.utils.data.Dataset[Window]):
             raise UsageError(f"rest_s is {rest_s}; it must be a number of seconds above 0.")
         self.dataset, self.context, self.horizon, self.stride = dataset, context, horizon, stride
         self.stream, self.dtype, self.rest_s, self.scale = stream, dtype, rest_s, scale
+        self._image_options = images
         self._patterns = (inputs, targets) if columns is None else (columns, columns)
         self._names = list(dataset.recordings)
         self._content: _Decoded | None = None
@@ -163,15 +171,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     def __getitem__(self, index: int) -> Window:
         """Return one window. Raises `IndexError` after the last."""
-        decoded, position = self._decoded, self._positions_of([index])[0]
-        start = int(decoded.starts[position])
-        split, stop = start + self.context, start + self.context + self.horizon
-        return {
-            "past": self._past.apply(decoded.values[start:split]),
-            "future": self._future.apply(decoded.values[split:stop]),
-            "t_ns": decoded.t_ns[start:stop],
-            "recording": self._names[int(np.searchsorted(decoded.windows, position, side="right"))],
-        }
+        return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Window]:
         """Return several windows, gathered at once. Raises `IndexError` after the last."""
@@ -181,11 +181,16 @@ class Windows(torch.utils.data.Dataset[Window]):
         values = decoded.values.index_select(0, rows).view(len(positions), length, -1)
         t_ns = decoded.t_ns.index_select(0, rows).view(len(positions), length)
         past, future = self._past.apply(values[:, : self.context]), self._future.apply(values[:, self.context :])
-        names = [self._names[owner] for owner in np.searchsorted(decoded.windows, positions, side="right").tolist()]
-        return [
-            {"past": before, "future": after, "t_ns": times, "recording": name}
-            for before, after, times, name in zip(past.unbind(), future.unbind(), t_ns.unbind(), names, strict=True)
+        owners = np.searchsorted(decoded.windows, positions, side="right").tolist()
+        items: list[Window] = [
+            {"past": before, "future": after, "t_ns": times, "recording": self._names[owner]}
+            for before, after, times, owner in zip(past.unbind(), future.unbind(), t_ns.unbind(), owners, strict=True)
         ]
+        if decoded.images is not None:
+            first_rows = np.append(0, decoded.rows)[owners]
+            for item, owner, start in zip(items, owners, decoded.starts[positions] - first_rows, strict=True):
+                item["images"] = decoded.images.read(owner, np.arange(start, start + self.context))
+        return items
 
     def _positions_of(self, indices: Sequence[int]) -> list[int]:
         """Return the places of windows, counted from the first. Raises `IndexError` after the last."""
@@ -301,8 +306,9 @@ class Windows(torch.utils.data.Dataset[Window]):
             values = _GrowingArray(np.zeros((0, 0), self.dtype))
             t_ns = _GrowingArray(np.zeros(0, np.int64))
             rows, windows, starts = [], [], [np.zeros(0, np.int64)]
+            images = None if self._image_options is None else WindowImages(self._image_options)
             for name in self._names:
-                own_values, own_t_ns, own_starts = self._decode_recording(self.dataset[name])
+                own_values, own_t_ns, own_starts = self._decode_recording(self.dataset[name], images)
                 starts.append(own_starts + t_ns.rows)
                 values.append(own_values)
                 t_ns.append(own_t_ns)
@@ -314,15 +320,21 @@ class Windows(torch.utils.data.Dataset[Window]):
                 np.cumsum(rows, dtype=np.int64),
                 np.concatenate(starts),
                 np.cumsum(windows, dtype=np.int64),
+                images,
             )
         return self._content
 
-    def _decode_recording(self, recording: ReadableRecording) -> tuple[AnyArray, Int64s, Int64s]:
+    def _decode_recording(
+        self, recording: ReadableRecording, images: WindowImages | None
+    ) -> tuple[AnyArray, Int64s, Int64s]:
         """Return values (row, channel), times (row,) and first rows of windows (window,) of a recording.
+
+        Its frames are added to ``images``.
 
         Raises `UsageError` if its channels differ from those of the others.
         """
-        table = recording.table(self.stream)
+        stored = recording.columns(self.stream)
+        table = stored.read([field.name for field in stored.schema if not holds_bytes(field)])
         t_ns = streams.times(table)
         all_columns = arrays.arrays_of_table(table)
         inputs, targets = (_matching(patterns, all_columns, recording.name) for patterns in self._patterns)
@@ -341,10 +353,15 @@ class Windows(torch.utils.data.Dataset[Window]):
         else:
             values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
         usable: Bools = ~streams.unusable_rows(table) & np.isfinite(values).all(axis=1)
+        reasons = [(IN_GAP, ~usable)]
+        if images is not None:
+            has_image = images.add(recording, t_ns)
+            reasons.append((NO_IMAGE, ~has_image))
+            usable &= has_image
         groups = np.cumsum(run_starts(t_ns, streams.max_step(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
         inside = rows_in_windows(starts, self.context + self.horizon, len(t_ns))
-        count_rows(recording.name, self.stream, RowCounts.from_masks(inside, [(IN_GAP, ~usable)]))
+        count_rows(recording.name, self.stream, RowCounts.from_masks(inside, reasons))
         return values, t_ns, starts
 
 

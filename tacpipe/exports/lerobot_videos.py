@@ -23,8 +23,10 @@ from tacpipe.arrays import Bytes, Floats, Int64s
 from tacpipe.channels.schema import DAMAGED
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.plugins import extras
-from tacpipe.video.decoding import decode_frames, read_batches, read_frames
+from tacpipe.signals import resampling
+from tacpipe.video.decoding import decode_frames, read_batches
 from tacpipe.video.files import add_stream
+from tacpipe.video.frames import read_frames
 from tacpipe.video.stream import (
     BATCH_ROWS,
     DTS,
@@ -118,12 +120,7 @@ def find_cameras(originals: Dataset) -> tuple[list[VideoFeature], list[tuple[str
 
 def nearest_rows(columns: Columns, synchronized: Columns) -> Int64s:
     """Return the row of the nearest frame of a stream for each row of the ``synchronized`` recording."""
-    t_ns = columns.column(TIME).to_numpy()
-    grid_ns = synchronized.column(TIME).to_numpy()
-    after = np.clip(np.searchsorted(t_ns, grid_ns), 1, max(1, len(t_ns) - 1))
-    later = np.minimum(after, len(t_ns) - 1)
-    is_later = np.abs(t_ns[later] - grid_ns) < np.abs(t_ns[after - 1] - grid_ns)
-    rows: Int64s = np.where(is_later, later, after - 1).astype(np.int64)
+    rows: Int64s = resampling.nearest_rows(columns.column(TIME).to_numpy(), synchronized.column(TIME).to_numpy())
     return rows
 
 

@@ -109,10 +109,10 @@ class SelectedRows:
         """Return one column."""
         return self._columns.column(name).filter(pa.array(self._mask))
 
-    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield tables of consecutive rows, with only ``columns``."""
+    def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
+        """Yield tables of consecutive rows, at most ``rows`` each, with only ``columns``."""
         first = 0
-        for table in self._columns.batches(columns):
+        for table in self._columns.batches(columns, rows):
             yield table.filter(pa.array(self._mask[first : first + table.num_rows]))
             first += table.num_rows
 
@@ -120,8 +120,11 @@ class SelectedRows:
 class RowRanges:
     """Decodes ranges of a stream's rows that move forward and may overlap; each row is decoded once."""
 
-    def __init__(self, columns: Columns | SelectedRows) -> None:
-        self._batches = columns.batches()
+    def __init__(
+        self, columns: Columns | SelectedRows, names: Sequence[str] | None = None, rows: int = SOME_ROWS
+    ) -> None:
+        """Read the columns ``names`` (None for all), of which ``rows`` rows are decoded at once."""
+        self._batches = columns.batches(names, rows)
         self._pieces: list[pa.Table] = []  # decoded rows up to ``_stop``
         self._stop = 0
 

@@ -23,6 +23,7 @@ IN_GAP = "in a gap or without a value"
 NO_CONTACT = "without contact"
 NO_WINDOW = "in no window"  # too close to a gap, a contact's end or the recording's end
 NO_LABEL = "without a label"
+NO_IMAGE = "without a sound frame of each camera"
 MARKED = "marked"  # the time of the sample is uncertain
 MEASURED = "already measured"  # the next sample had arrived together with this one
 UNNEEDED = "in streams that are not needed"

@@ -9,8 +9,8 @@ import numpy as np
 from tacpipe.comparison.runs import RecordingOutcome
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.report.blocks import Fold, ImageRow, Picture, fold, notes
-from tacpipe.video.decoding import read_frames
 from tacpipe.video.encoding import encode_images, jpeg_format
+from tacpipe.video.frames import read_frames
 from tacpipe.video.stream import read_format
 
 SHOWN = 4  # number of right and of wrong predictions with frames

@@ -79,14 +79,15 @@ def window_starts(groups: AnyArray, usable: Bools, context: int, horizon: int, s
 
     A window is within one group, such as a recording or a contact (``groups`` (time,) has its number), and all its rows
     are ``usable`` (time,). ``stride`` is counted from the start of each contiguous run, so that windows do not depend on
-    earlier rows. Raises `TacpipeError` if a length is below 1.
+    earlier rows. Raises `TacpipeError` if a length is below 1, or the horizon below 0.
 
     >>> window_starts(np.array([0, 0, 0, 1, 1, 1]), np.ones(6, dtype=bool), context=1, horizon=1).tolist()
     [0, 1, 3, 4]
     """
-    if min(context, horizon, stride) < 1:
+    if min(context, stride) < 1 or horizon < 0:
         raise TacpipeError(
-            f"A window has context {context}, horizon {horizon} and stride {stride}; each must be at least 1."
+            f"A window has context {context}, horizon {horizon} and stride {stride}; context and stride must be at least 1, "
+            f"and the horizon at least 0."
         )
     rows, length = len(groups), context + horizon
     if rows < length:

@@ -9,7 +9,7 @@ it. FFmpeg gives an invented image for most of them; here they have none.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -30,9 +30,7 @@ from tacpipe.video.stream import (
     PACKET,
     PTS,
     VideoFormat,
-    cut_rows,
     in_decode_order,
-    read_format,
 )
 
 if TYPE_CHECKING:
@@ -63,9 +61,36 @@ def decode_frames(
     packet, is skipped. Few frames are in memory at once. Raises `TacpipeError` if a frame has another size, and
     `MissingModuleError` if PyAV is not installed.
     """
-    for row, frame in _decode(video_format, batches):
-        image: Bytes | None = frame and frame.to_ndarray(format=GREY if grey else RGB, threads=1)
-        yield row, image
+    pixels = GREY_PIXELS if grey else COLOUR_PIXELS
+    for row, frame in raw_frames(video_format, batches):
+        yield row, None if frame is None else pixels.of(frame)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """The part of a frame that becomes an image, and the image's format and size. The default is the frame in colour."""
+
+    format: str = RGB  # FFmpeg's name
+    # left, top, width and height of the part in pixels; None for the complete frame
+    roi: tuple[int, int, int, int] | None = None
+    size: tuple[int, int] | None = None  # height and width of the image in pixels; None for those of the part
+
+    def of(self, frame: Any) -> Bytes:
+        """Return the image of PyAV's frame, uint8 (height, width, rgb), or (height, width) for grey."""
+        if self.roi is not None:
+            import av
+
+            left, top, width, height = self.roi
+            part = frame.to_ndarray(format=self.format, threads=1)[top : top + height, left : left + width]
+            if self.size is None:
+                return np.ascontiguousarray(part)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(part), format=self.format)
+        height_px, width_px = self.size or (None, None)
+        image: Bytes = frame.to_ndarray(format=self.format, height=height_px, width=width_px, threads=1)
+        return image
+
+
+COLOUR_PIXELS, GREY_PIXELS = Pixels(), Pixels(GREY)
 
 
 def damaged_frames(video_format: VideoFormat, batches: Iterable[pa.Table], suspect: Bools) -> Bools:
@@ -74,7 +99,7 @@ def damaged_frames(video_format: VideoFormat, batches: Iterable[pa.Table], suspe
     The other arguments and the errors are those of `decode_frames`.
     """
     damaged = np.zeros(len(suspect), bool)
-    for row, frame in _decode(video_format, batches, suspect):
+    for row, frame in raw_frames(video_format, batches, suspect):
         damaged[row] = frame is None
     return damaged
 
@@ -103,9 +128,14 @@ def cell_means(image: Bytes | Floats, rows: int, columns: int) -> Floats:
 def jpeg_images(video_format: VideoFormat, batches: Iterable[pa.Table]) -> Iterator[tuple[int, bytes]]:
     """Yield row number and JPEG of each sound frame, re-encoded with some loss for viewers."""
     encoder = JpegEncoder(video_format.width_px, video_format.height_px, "yuvj420p")
-    for row, frame in _decode(video_format, batches):
+    for row, frame in raw_frames(video_format, batches):
         if frame is not None:
             yield row, encoder.encode(frame)
+
+
+def decoded_columns(columns: Columns) -> list[str]:
+    """Return the names of the columns of a stream of frames that decoding reads."""
+    return [name for name in (PACKET, PTS, DTS, KEY_FRAME, DAMAGED) if name in columns.column_names]
 
 
 def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> Iterator[pa.Table]:
@@ -115,8 +145,7 @@ def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> I
     """
     first = 0
     end = columns.num_rows if stop is None else stop
-    names = [name for name in (PACKET, PTS, DTS, KEY_FRAME, DAMAGED) if name in columns.column_names]
-    for batch in columns.batches(names, BATCH_ROWS):
+    for batch in columns.batches(decoded_columns(columns), BATCH_ROWS):
         rows = batch.slice(max(0, start - first), max(0, end - max(first, start)))
         if rows.num_rows:
             yield rows
@@ -125,30 +154,7 @@ def read_batches(columns: Columns, start: int = 0, stop: int | None = None) -> I
             return
 
 
-def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) -> dict[int, Bytes]:
-    """Return the images of some rows of a stream of frames by row, as `decode_frames` yields them.
-
-    For each row, decoding starts at the preceding key frame. Raises `TacpipeError` if the stream has no frames. Damaged
-    frames and rows without an image are missing.
-    """
-    video_format = read_format(columns)
-    if video_format is None:
-        raise TacpipeError("This stream holds no frames. Give the stream of a camera.")
-    clocks = columns.read([DTS, KEY_FRAME])
-    dts, key_frame = clocks[DTS].to_numpy(), clocks[KEY_FRAME].to_numpy()
-    images: dict[int, Bytes] = {}
-    pending = sorted(set(rows))
-    while pending:
-        start, stop = cut_rows(dts, key_frame, pending[0], pending[0] + 1)
-        group = [row for row in pending if row < stop]
-        for index, frame in _decode(video_format, read_batches(columns, start, stop)):
-            if start + index in group and frame is not None:
-                images[start + index] = frame.to_ndarray(format=GREY if grey else RGB, threads=1)
-        pending = pending[len(group) :]
-    return images
-
-
-def _decode(
+def raw_frames(
     video_format: VideoFormat, batches: Iterable[pa.Table], suspect: Bools | None = None
 ) -> Iterator[tuple[int, Any]]:
     """Yield row number and decoded frame of PyAV, or None if it is damaged, as those that are ``suspect`` (frame,).

@@ -212,14 +212,51 @@ def cut_rows(dts: Int64s, key_frame: Bools, start: int, stop: int) -> tuple[int,
     It starts at a key frame, and no frame in it needs one that is presented later. Raises `TacpipeError` if no key
     frame precedes ``start``, or the rows are not in the stream.
     """
-    if not 0 <= start < stop <= len(dts):
-        raise TacpipeError(f"The rows {start} to {stop} are not in a stream of {len(dts)} frames.")
-    keys = np.flatnonzero(key_frame[: start + 1])
-    if not len(keys):
+    ((first, last),) = _ranges(dts, key_frame, np.array([start]), np.array([stop]))
+    return int(first), int(last)
+
+
+def decodable_ranges(dts: Int64s, key_frame: Bools, rows: Int64s) -> Int64s:
+    """Return start and stop (exclusive) of the ranges to decode for increasing ``rows``, as (range, 2).
+
+    Each row is in the range that `cut_rows` returns for it; ranges that touch are joined. Raises the errors of `cut_rows`.
+    """
+    if not len(rows):
+        return np.zeros((0, 2), np.int64)
+    starts, stops = _ranges(dts, key_frame, rows, rows + 1).T
+    firsts = np.flatnonzero(np.append(True, starts[1:] > np.maximum.accumulate(stops)[:-1]))
+    return np.column_stack([starts[firsts], np.maximum.reduceat(stops, firsts)])
+
+
+def group_bounds(dts: Int64s, key_frame: Bools) -> Int64s:
+    """Return the first row of each group of pictures that can be decoded by itself, and the number of rows (group + 1,).
+
+    Rows before the first key frame belong to no group.
+    """
+    keys = np.flatnonzero(key_frame)
+    bounds = keys[np.isin(keys, _cuts(dts)) | (keys == keys[:1])]
+    return np.append(bounds, len(dts))
+
+
+def _ranges(dts: Int64s, key_frame: Bools, starts: Int64s, stops: Int64s) -> Int64s:
+    """Return the range of `cut_rows` for each pair of ``starts`` and ``stops``, as (pair, 2)."""
+    is_outside = (starts < 0) | (starts >= stops) | (stops > len(dts))
+    if is_outside.any():
+        at = int(np.argmax(is_outside))
+        raise TacpipeError(f"The rows {starts[at]} to {stops[at]} are not in a stream of {len(dts)} frames.")
+    keys = np.flatnonzero(key_frame)
+    before = np.searchsorted(keys, starts, side="right")  # number of key frames up to each start
+    if not before.all():
         raise TacpipeError(
-            f"Frame {start} cannot be decoded: no key frame precedes it. Record or export the video from a key frame on."
+            f"Frame {starts[np.argmin(before)]} cannot be decoded: no key frame precedes it. Record or export the video "
+            f"from a key frame on."
         )
+    cuts = _cuts(dts)
+    return np.column_stack([keys[before - 1], cuts[np.searchsorted(cuts, stops)]])
+
+
+def _cuts(dts: Int64s) -> Int64s:
+    """Return the rows before which a stream can be cut, and the number of rows: no later one is decoded before it."""
     latest = np.maximum.accumulate(dts)  # (row,)
     earliest = np.minimum.accumulate(dts[::-1])[::-1]  # (row,), earliest decoding time of this row and all later ones
-    is_boundary = np.append(latest[:-1] < earliest[1:], True)  # whether a cut may follow each row
-    return int(keys[-1]), stop + int(np.argmax(is_boundary[stop - 1 :]))
+    return 1 + np.flatnonzero(np.append(latest[:-1] < earliest[1:], True))

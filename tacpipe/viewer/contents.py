@@ -28,7 +28,8 @@ from tacpipe.traces.curves import TIME, Curves, Path
 from tacpipe.traces.predictions import Classification, DrawnForecast
 from tacpipe.traces.spans import FaultMark, Span
 from tacpipe.traces.taxels import Taxels
-from tacpipe.video.decoding import jpeg_images, read_frames
+from tacpipe.video.decoding import jpeg_images
+from tacpipe.video.frames import read_frames
 from tacpipe.video.images import picture_encoding
 from tacpipe.video.stream import BATCH_ROWS, PACKET, read_format
 from tacpipe.viewer.markers import MarkerTrack, track_markers

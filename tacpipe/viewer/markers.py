@@ -14,7 +14,7 @@ from tacpipe.channels.schema import field_metadata
 from tacpipe.datasets.dataset import Recording
 from tacpipe.store.records import Step
 from tacpipe.traces.curves import TIME
-from tacpipe.video.decoding import read_frames
+from tacpipe.video.frames import read_frames
 from tacpipe.video.markers import GridSearch
 from tacpipe.video.stream import read_format
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tacpipe.recording.station import LOST, OPENED
-from tacpipe.video.decoding import read_frames
+from tacpipe.video.frames import read_frames
 from tacpipe.video.stream import read_format
 from tests.conftest import Lab
 from tests.emulation.byte_faults import Faults

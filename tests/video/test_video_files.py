@@ -14,7 +14,7 @@ from tacpipe.arrays import Bytes
 from tacpipe.errors import TacpipeError
 from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
-from tacpipe.video import decoding, files, stream
+from tacpipe.video import decoding, files, frames, stream
 from tests.video import videos
 from tests.video.videos import Kind
 
@@ -118,10 +118,10 @@ def test_every_cut_decodes_to_the_frames_of_the_whole_video(
 
 def test_single_frames_are_read_without_the_rest(open_groups: tuple[Columns, list[Bytes]]) -> None:
     columns, expected = open_groups
-    images = decoding.read_frames(columns, [39, 0, 17])
+    images = frames.read_frames(columns, [39, 0, 17])
     assert sorted(images) == [0, 17, 39]
     assert all(np.array_equal(image, expected[row]) for row, image in images.items())
-    grey = decoding.read_frames(columns, [3], grey=True)[3]
+    grey = frames.read_frames(columns, [3], grey=True)[3]
     assert grey.shape == (videos.HEIGHT, videos.WIDTH)
 
 
