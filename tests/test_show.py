@@ -99,6 +99,13 @@ def test_the_numbers_of_a_stream_are_those_of_its_samples() -> None:
     assert show_recording.stream_figures(columns, streams.read_clocks(columns)) == FIGURES
 
 
+def test_a_stream_whose_last_value_is_missing_is_counted_as_any_other() -> None:
+    table = _skin().slice(0, 4)
+    assert table["other"][-1].as_py() is None
+    figures = show_recording.stream_figures(Columns(to_parquet(table)), None)
+    assert (figures["held_share"], figures["saturated"]) == (round(1 / 3, 4), 3)
+
+
 @pytest.mark.parametrize("counted", [False, True])
 def test_clocks_that_are_read_in_pieces_have_the_gaps_and_the_rate_of_the_whole(
     monkeypatch: pytest.MonkeyPatch, counted: bool

@@ -260,9 +260,10 @@ def _brief_record(param: Any, ctx: Any) -> tuple[str, str]:
     """Return the syntax and help of a parameter as `_record` does, with only the first clause of the help."""
     names, text = _record(param, ctx)
     default = re.search(r" \[default: [^\]]+\]$", text)
-    clause = re.split(r"; |: |\. |\.$", text[: default.start()] if default else text)[0]
-    if " " not in clause:  # The clause is only the name of the first choice.
-        clause = text.partition(";")[0]
+    described = text[: default.start()] if default else text
+    clause = re.split(r"; |: |\. |\.$", described)[0]
+    if " " not in clause:  # the name of the first choice, as in "auto: as many as ..."; its description is needed too
+        clause = described.partition(";")[0]
     return names, clause + (default[0] if default else "")
 
 

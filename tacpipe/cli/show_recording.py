@@ -260,12 +260,13 @@ def gaps_text(figures: StreamFigures) -> str:
 def _count_repeats_and_limits(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
     """Return the fraction of rows that repeat the previous row, and the number of values at a limit of their type.
 
-    Only about the first `SAMPLED_ROWS` rows are read. A missing value does not count as repeated.
+    There are at least two rows, of which about the first `SAMPLED_ROWS` are read. A missing value does not count as
+    repeated.
     """
     import numpy as np
 
     rows, repeated_rows, saturated = 0, 0, 0
-    last: dict[str, int] = {}
+    last: dict[str, float] = {}
     for batch in columns.batches(names):
         repeated = np.ones(batch.num_rows, dtype=bool)  # (time,)
         for name in names:
@@ -274,7 +275,7 @@ def _count_repeats_and_limits(columns: Columns, names: Sequence[str]) -> tuple[f
             saturated += int(((values == limits.max) | (values == limits.min)).sum())
             repeated[1:] &= values[1:] == values[:-1]
             repeated[:1] &= name in last and bool(values[0] == last[name])
-            last[name] = int(values[-1])
+            last[name] = values[-1]
         repeated_rows += int(repeated.sum())
         rows += batch.num_rows
         if rows >= SAMPLED_ROWS:
@@ -310,7 +311,10 @@ def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
 
 
 def streams_table(recordings: Mapping[str, Mapping[str, StreamFigures]], *, alone: bool = False) -> TerminalTable:
-    """Return a table with the figures of each stream by recording; of one ``alone`` without its name, with mean rates."""
+    """Return a table with the figures of each stream by recording.
+
+    With ``alone`` there is one recording: the column with its name is left out. Otherwise that of the mean rates is.
+    """
     heads = ("recording", "stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
     left_out = 0 if alone else heads.index("mean Hz")
     rows = []

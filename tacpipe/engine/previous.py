@@ -189,7 +189,11 @@ def _subtract(counts: Mapping[str, int], replaced: Sequence[Mapping[str, int]], 
 
 
 def _subtract_rows(rows: dict[str, StageRows], replaced: Mapping[str, StageRows]) -> dict[str, StageRows]:
-    """Return the rows of the results that are not ``replaced``, or none if records were computed again in between."""
+    """Return the counts of ``rows`` less those of ``replaced``, which are no longer part of the result.
+
+    Returns no counts if ``replaced`` has stages or more rows that ``rows`` lacks: records were then computed again after
+    ``rows`` were counted. ``rows`` are changed.
+    """
     try:
         for stage, counted in replaced.items():
             rows[stage].subtract(counted)

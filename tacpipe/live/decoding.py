@@ -40,7 +40,11 @@ class Decoder:
             self._waiting.append(block)
 
     def may_contain(self, until_ns: int) -> bool:
-        """Return whether pending bytes may contain a sample that arrived, or started to arrive, by ``until_ns``."""
+        """Return whether pending bytes may contain a sample that arrived, or started to arrive, by ``until_ns``.
+
+        Only new bytes can complete a frame, so there is none without bytes that wait. A note that waits, such as of a
+        loss, can complete one too.
+        """
         if not self._waiting:
             return False
         first = self._waiting[0]

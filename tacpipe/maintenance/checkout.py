@@ -77,7 +77,10 @@ def list_manifests(store: AnyStore) -> list[Known]:
 
 
 def _state(root: Root, name: str) -> str:
-    """Return what happened to the manifest ``name``, the last one written at the path of ``root``, as a constant."""
+    """Return what happened to the manifest ``name``, the last one written at the path of ``root``, as a constant.
+
+    A path that is a file, such as a report, counts as showing its manifest: files are not compared.
+    """
     if root["kind"] == PUSHED:
         return IN_STORE
     path = Path(root["path"])

@@ -352,8 +352,9 @@ def _sound(content: bytes, path: Path) -> manifest_of.Found:
 def has_expired(store: AnyStore, root: Root, grace_days: float, *, reached: bool, dry_run: bool) -> bool:
     """Return whether a root's path has been unreachable for the whole grace period.
 
-    The first failed access starts the period, and a successful one resets it. A clock from before the root was written
-    is wrong and starts none, because the period would have ended when the clock is set.
+    The first failed access starts the period, and a successful one ends it; both are written to the root unless
+    ``dry_run``. While the clock shows a time before the root was written, it is wrong, and no period starts: as soon as
+    the clock was corrected, such a period would be over.
     """
     now_s = int(time.time())
     counts = not reached and now_s >= root.get("written_s", 0)

@@ -41,9 +41,11 @@ def probabilities(scores: AnyFloats, temperature: float = 1.0) -> Floats:
 
 
 def temperature(scores: AnyFloats, labels: Ints) -> float:
-    """Return the maximum-likelihood temperature for smoothed labels (slide,), the columns of ``scores`` (slide, class).
+    """Return the temperature with the highest likelihood of the labels.
 
-    Raises `TacpipeError` if there are no slides.
+    ``scores`` (slide, class) are -inf for classes that a slide cannot have, and ``labels`` (slide,) are the classes of
+    the slides. Labels are smoothed with a weight of 1 / (slides + 2), as in Platt's calibration (1999), so that few
+    slides that are all correct do not make the model certain. Raises `TacpipeError` if there are no slides.
     """
     if not len(labels):
         raise TacpipeError("There is no slide to fit a temperature on. Make a split with slides of the role val.")

@@ -269,7 +269,11 @@ class Bucket:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Return whether a request may succeed if it is repeated: the server did not understand and refuse it."""
+    """Return whether a failed request may succeed if it is repeated.
+
+    It may not if the server refused it (4xx, except timeouts and too many requests), and if the client could not even
+    send it, because it found no credentials or could not build the request.
+    """
     text = str(error)
     status = _STATUS.search(text)
     is_refusal = status is not None and status[1][0] == "4" and status[1][:3] not in ("408", "429")

@@ -165,7 +165,10 @@ class CachedStore(Store):
         return stored_bytes is not None and size in (None, stored_bytes)
 
     def _query_bucket(self, names: Iterable[str]) -> None:
-        """Look up the sizes of these objects, unless they are known, with one query of the bucket."""
+        """Look up the sizes of these objects, unless they are known, with one query of the bucket.
+
+        The collectors of other computers are told before that these objects are in use.
+        """
         unknown = [name for name in names if name not in self._bucket_sizes and not present(self.object_path(name))]
         self._requested.clear()
         self._announce(unknown)
@@ -232,7 +235,7 @@ class CachedStore(Store):
         return stored
 
     def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
-        """Implement `Store.put_written`. The object is uploaded as by `put`."""
+        """Implement `Store.put_written`. As that of `put`, the object is uploaded with the record that names it."""
         self.prepare()
         stored = super().put_written(write, durable=durable)
         self._not_uploaded.add(stored.digest)
@@ -291,13 +294,13 @@ class CachedStore(Store):
         replace: bool = False,
         durable: bool = False,
     ) -> Record:
-        """Implement `Store.commit` in the bucket. The record's objects are uploaded first."""
-        self._begin()
+        """Implement `Store.commit` in the bucket, which gets a store if it has none. The record's objects come first."""
+        self._create_remote_store()
         self._upload([name for name in dict.fromkeys(records.digests(result)) if name in self._not_uploaded])
         committed = self.bucket.commit(identity, result, provenance, replace=replace)
         return self._keep_record(committed, durable=durable)
 
-    def _begin(self) -> None:
+    def _create_remote_store(self) -> None:
         """Create the store in the bucket if it does not exist."""
         key = os.getpid(), self.root
         if key not in _stores:

@@ -319,10 +319,10 @@ def _has_locks(handle: int) -> bool:
 
 
 def _try_lock(path: Path, *, create: bool = True) -> int | None:
-    """Return an open handle that holds the lock, or None if another process holds it.
+    """Return an open handle that holds the lock, or None if another process holds it or deletes the file.
 
-    On a file system without locks, every caller gets the lock: a lease saves duplicate work, but no result depends on
-    it.
+    ``create``: whether a missing file is created; otherwise `FileNotFoundError` is raised. On a file system without locks,
+    every caller gets the lock: a lease saves duplicate work, but no result depends on it.
     """
     with readable_errors(path.parent.parent):
         handle = patiently(lambda: _open(path, is_new=create))

@@ -38,7 +38,7 @@ def read_frames(columns: Columns, rows: Sequence[int], *, grey: bool = False) ->
     The stream is read once, and decoding starts at the key frame before each row. Raises `TacpipeError` if the stream
     has no frames. Damaged frames and rows without an image are missing.
     """
-    stream, packets = _Stream(columns), RowRanges(columns, decoded_columns(columns), BATCH_ROWS)
+    stream, packets = _FrameIndex(columns), RowRanges(columns, decoded_columns(columns), BATCH_ROWS)
     wanted, pixels = set(rows), GREY_PIXELS if grey else COLOUR_PIXELS
     images: dict[int, Bytes] = {}
     for start, stop in decodable_ranges(stream.dts, stream.key_frame, np.array(sorted(wanted), np.int64)).tolist():
@@ -60,7 +60,7 @@ class FrameReader:
 
         Raises `TacpipeError` if the stream has no frames.
         """
-        self._stream, self._name, self._pixels = _Stream(columns), name, pixels
+        self._stream, self._name, self._pixels = _FrameIndex(columns), name, pixels
         self._keys = np.flatnonzero(self._stream.key_frame)
         self._groups = group_bounds(self._stream.dts, self._stream.key_frame)
         self._batches, masks = [], [np.zeros(0, bool)]
@@ -106,8 +106,8 @@ class FrameReader:
                 yield table.slice(row - first, min(READ_ROWS, stop - row))
 
 
-class _Stream:
-    """Format and key frames of a stream of frames. Raises `TacpipeError` if it has no frames."""
+class _FrameIndex:
+    """Format, decoding order and key frames of a stream of frames. Raises `TacpipeError` if it has no frames."""
 
     def __init__(self, columns: Columns) -> None:
         video_format = read_format(columns)

@@ -102,7 +102,10 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
 
 @contextlib.contextmanager
 def encrypted(address: str, jobs: int) -> Iterator[Dask]:
-    """Yield the workers of the scheduler at ``address``, connected with TLS. Raises the errors of `connected`."""
+    """Yield the workers of the scheduler at ``address``, connected with TLS. The scheduler sets the number of ``jobs``.
+
+    Raises `UsageError` without an address or certificates, and the errors of `connected`, which has no TLS.
+    """
     if not address:
         raise UsageError("The executor tls needs the address of a scheduler: give tls://HOST:PORT.")
     with extras.explain_missing("The executor tls"):
