@@ -26,6 +26,7 @@ WORKS: dict[str, Callable[[Any], Any]] = {
 NAMED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "dataset.head()": (lambda dataset: dataset.head(), r"to_pandas\(STREAM\)"),
     "dataset.columns": (lambda dataset: dataset.columns, "streams lists the columns"),
+    "dataset.select(list)": (lambda dataset: dataset.select(list(dataset.recordings)), r"select\(\*names\)"),
     "dataset.filter": (lambda dataset: dataset.filter(object="cup"), "select"),
     "recording.plot()": (lambda dataset: dataset[0].plot(), "tacpipe show DATASET RECORDING --plot"),
     "recording.xela1": (lambda dataset: dataset[0].xela1, r"recording\['xela1'\]"),
@@ -58,7 +59,7 @@ def test_first_guesses_in_python_work_or_name_what_does(lab: Lab) -> None:
     failed = [guess for guess, check in WORKS.items() if not check(dataset)]
     assert not failed
     for guess, (call, hint) in NAMED.items():
-        with pytest.raises(AttributeError, match=hint):
+        with pytest.raises((AttributeError, tacpipe.UsageError), match=hint):
             call(dataset)
             pytest.fail(f"{guess} works")
 

@@ -81,8 +81,12 @@ def select_names(
 ) -> list[str]:
     """Return the names of the recordings that match a pattern, have the role and meet each condition on a label.
 
-    Raises `UsageError` if there are none, and for a label that no recording has.
+    Raises `UsageError` if there are none, for a label that no recording has, and for a pattern that is no text.
     """
+    if not all(isinstance(pattern, str) for pattern in patterns):
+        raise UsageError(
+            "A name is a text. For a list of names, write select(*names), or only(names) without patterns."
+        )
     names = [
         name for name in dataset.recordings if not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
     ]
