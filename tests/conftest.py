@@ -93,6 +93,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     deselected |= left_out([id(item) for item in items], config.getoption("--every"))
     config.hook.pytest_deselected(items=[item for item in items if id(item) in deselected])
     items[:] = [item for item in items if id(item) not in deselected]
+    items.sort(
+        key=lambda item: item.get_closest_marker("minutes") is None
+    )  # last, they would keep one worker busy alone
 
 
 def left_out(items: Sequence[int], part: str) -> set[int]:

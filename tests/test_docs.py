@@ -152,6 +152,7 @@ def test_every_other_command_and_group_has_a_summary_that_is_a_sentence() -> Non
 
 
 @pytest.mark.long
+@pytest.mark.minutes
 def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_path: Path) -> None:
     """One project folder serves all pages, so what one page computed is reused on the next."""
     project = tmp_path / "project"
@@ -430,14 +431,15 @@ PREPARED = {  # commands that must run before the example of a command
     "compare": ("evaluate models/forward data/segments --split data/split -o results/forward-gru",),
 }
 SHORT = """
-train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10},
-  regress: {stride: 20}, classify: {stride: 20}}
+train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10, baselines: false},
+  regress: {stride: 20, architecture: linear}, classify: {stride: 20, architecture: linear}, slip: {architecture: linear}}
 compress: {autoencoder: {epochs: 1, search: 0}}
 """
 CHAIN = "stages: {train: {cmd: tacpipe version}, evaluate: {cmd: tacpipe version}, forward: {cmd: tacpipe version}}"
 
 
 @pytest.mark.long
+@pytest.mark.minutes
 def test_the_examples_of_all_help_texts_run_as_pasted(tmp_path: Path) -> None:
     """They run in the order of the reference, in one project whose ``params.yaml`` makes trainings short."""
     (tmp_path / ".tacpipe").mkdir()
