@@ -270,14 +270,13 @@ class Generic(layout.DescribedSensor):
 
 def _channels_of_number(number: layout.Number) -> list[tuple[str, dict[str, str]]]:
     """Return the name and metadata of each channel of a number, which may be an array with axes."""
-    metadata = {"unit": number.unit, "quantity": number.quantity}
+    quantity = sensor.quantity_of(number.name, number.quantity)
+    metadata = {"unit": number.unit, "quantity": quantity}
     channels: list[tuple[str, dict[str, str]]] = []
     names = [number.name] if number.count == 1 else sensor.numbered_names(number.name, number.count)
     for taxel, name in enumerate(names, start=1):
-        taxel_metadata = (
-            metadata if number.count == 1 or number.quantity != "tactile" else {**metadata, "taxel": str(taxel)}
-        )
-        key = "axis" if number.quantity == "tactile" else "component"
+        taxel_metadata = metadata if number.count == 1 or quantity != "tactile" else {**metadata, "taxel": str(taxel)}
+        key = "axis" if quantity == "tactile" else "component"
         channels += [(f"{name}_{axis}", {**taxel_metadata, key: axis}) for axis in number.axes] or [
             (name, taxel_metadata)
         ]

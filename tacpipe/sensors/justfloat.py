@@ -42,7 +42,8 @@ class JustFloat(Sensor):
     channels: int = 0  # number of floats in a frame, for model any; 0: the number of names
     names: tuple[str, ...] = ()  # channel names for model any; if empty, taxel01, taxel02, …
     unit: str = "1"  # unit of the channels, for model any
-    quantity: str = "tactile"  # quantity of the channels, for model any
+    # quantity of the channels, for model any; if empty, tactile for names with taxel, state for others
+    quantity: str = ""
     rate_hz: float = 100.0  # frames per second
     baud: int = 2_000_000  # baud rate of the port
 
@@ -77,12 +78,14 @@ class JustFloat(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return one float32 field per channel, with the option's names or ``taxel01``, …."""
-        metadata = {"unit": self.unit, "quantity": self.quantity}
-        if self.names:
-            return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]
+        if not self.names:
+            fields = sensor.taxel_fields(len(self.channel_positions), pa.float32(), self.unit)
+            quantity = sensor.quantity_of("taxel", self.quantity).encode()
+            return [field.with_metadata({**field.metadata, b"quantity": quantity}) for field in fields]
+        quantities = {name: sensor.quantity_of(name, self.quantity) for name in self.names}
         return [
-            field.with_metadata({**field.metadata, b"quantity": self.quantity.encode()})
-            for field in sensor.taxel_fields(len(self.channel_positions), pa.float32(), self.unit)
+            pa.field(name, pa.float32(), metadata={"unit": self.unit, "quantity": quantity})
+            for name, quantity in quantities.items()
         ]
 
     def framer(self) -> Framer:

@@ -42,7 +42,9 @@ class Number:
     count: int = 1  # number of elements
     axes: str = ""  # axes of each element, such as "xyz" for three numbers per taxel: taxel01_x, taxel01_y, …
     unit: str = "1"  # unit of the channel
-    quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md
+    # quantity of the channel, one of docs/reference/recordings.md; if empty, tactile for names with
+    # taxel, state for others
+    quantity: str = ""
     order: Order | None = None  # byte order, if it differs from that of the frame
     equals: int | None = None  # constant value; the number is then checked, and is not a channel
     skip: bool = False  # True if the number is not a channel

@@ -36,7 +36,9 @@ class LineColumn:
     name: str  # name of the channel; in taxel{1..4}_{x,y,z}, an array, the last braces vary fastest
     type: Type = "f32"  # u unsigned, i signed, f floating point, followed by the number of bits
     unit: str = "1"  # unit of the channel
-    quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md
+    # quantity of the channel, one of docs/reference/recordings.md; if empty, tactile for names with
+    # taxel, state for others
+    quantity: str = ""
     label: str = ""  # text before each number, such as "x:"; it may contain the braces of the name
     skip: bool = False  # True if the column is not a channel; it may then contain any text
 
@@ -136,7 +138,8 @@ def _expand(column: LineColumn) -> Iterator[LineCell]:
         pairs = list(zip(braces, values, strict=True))
         name = _fill(column.name, [value.zfill(brace.width) for brace, value in pairs])
         label = _fill(column.label, list(values))
-        metadata = {"unit": column.unit, "quantity": column.quantity, **_position_metadata(column.quantity, pairs)}
+        quantity = sensor.quantity_of(column.name, column.quantity)
+        metadata = {"unit": column.unit, "quantity": quantity, **_position_metadata(quantity, pairs)}
         yield LineCell(name, column.type, label, column.skip, metadata)
 
 

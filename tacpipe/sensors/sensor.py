@@ -198,6 +198,15 @@ def numbered_names(name: str, count: int) -> list[str]:
     return [f"{name}{number:0{digits}d}" for number in range(1, count + 1)]
 
 
+def quantity_of(name: str, stated: str) -> str:
+    """Return the ``stated`` quantity of a channel; if it is empty, tactile for a name with taxel, and state for others.
+
+    >>> quantity_of("taxel{1..4}", ""), quantity_of("joint1", ""), quantity_of("joint1", "angle")
+    ('tactile', 'state', 'angle')
+    """
+    return stated or ("tactile" if "taxel" in name else "state")
+
+
 def taxel_fields(
     count: int, kind: pa.DataType, unit: str, axes: str = "", prefix: str = "", **layout: str
 ) -> list[pa.Field]:

@@ -74,6 +74,13 @@ def test_a_boards_lines_by_hand_are_its_samples_with_counter_and_clock() -> None
     assert fields["tilt"] == {b"unit": b"deg", b"quantity": b"angle"}
 
 
+def test_columns_without_a_quantity_are_tactile_if_their_name_has_taxel_and_state_otherwise() -> None:
+    columns = [{"name": "taxel{1..2}"}, {"name": "joint{1..2}", "unit": "rad"}, {"name": "tilt", "quantity": "angle"}]
+    fields = lines(columns=columns).fields()
+    assert [field.metadata[b"quantity"].decode() for field in fields] == [*["tactile"] * 2, *["state"] * 2, "angle"]
+    assert [b"taxel" in field.metadata for field in fields] == [True, True, False, False, False]
+
+
 @pytest.mark.parametrize(
     ("pattern", "names", "last"),
     [
@@ -86,7 +93,7 @@ def test_a_boards_lines_by_hand_are_its_samples_with_counter_and_clock() -> None
 def test_braces_count_the_columns_and_say_which_taxel_each_is(
     pattern: str, names: list[str], last: dict[str, str]
 ) -> None:
-    fields = lines(columns=[{"name": pattern}]).fields()
+    fields = lines(columns=[{"name": pattern, "quantity": "tactile"}]).fields()
     assert [field.name for field in fields][: len(names)] == names
     metadata = {name.decode(): value.decode() for name, value in fields[-1].metadata.items()}
     assert {name: metadata[name] for name in metadata if name not in ("unit", "quantity")} == last
