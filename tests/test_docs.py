@@ -406,6 +406,7 @@ PARSED = {  # beginnings of examples of the help that are parsed and not run, an
     "ingest": "needs files of other programs; tests/formats reads such files",
     "live": "needs the devices of a rig",
     "sensors emulate": "runs until Ctrl-C",
+    "try": "needs files of a lab; tests/test_first_try.py runs it on some",
     "sensors probe": "needs a device",
     "store checkout": "names the digest of another store",
     "store pull": "needs another store",

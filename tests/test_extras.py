@@ -123,6 +123,7 @@ LACK = {  # Commands that need an extra, with that extra.
     "view data/synced --save {o}.rrd": "view",
     "live ws.toml --model models/forward --publish ws:127.0.0.1:1 --duration-s 1": "learn",
     "demo -o {o}": "learn",
+    "try bottle.ply -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
     "acquire serial.toml --dry-run": "devices",

@@ -33,6 +33,7 @@ SUMMARIES = {
     "store": "Manage the store: verify, repair, push, pull.",
     "candidates": "List grasps on an object, with the predicted touch of each.",
     "demo": "Run a whole pipeline on simulated recordings.",
+    "try": "Run a whole pipeline on your own files, with guesses.",
     "version": "Show the versions of tacpipe, Python and libraries.",
 }
 
@@ -214,6 +215,25 @@ def _add_demo(program: typer.Typer) -> None:
         terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
 
 
+def _add_try(program: typer.Typer) -> None:
+    """Add the command ``try``, which guesses how to read a folder, and runs a chain of commands on it."""
+
+    @program.command(
+        "try",
+        help=SUMMARIES["try"]
+        + "\n\nGuesses how to read the files, reads and checks them, puts the streams on one time axis, learns a label or a "
+        "force, and writes a report. Each step is a command that is printed, and the guesses are the file "
+        "OUTPUT/layout.toml: change them, and run the command again.\n\nExample: tacpipe try lab -o try",
+    )
+    def try_folder(
+        folder: Annotated[Path, typer.Argument(help="Folder with recordings, in any format that ingest reads.")],
+        output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")] = Path("try"),
+    ) -> None:
+        from tacpipe.cli import first_try
+
+        terminal.result(first_try.run(folder, output))
+
+
 def _add_version(program: typer.Typer) -> None:
     """Add the command ``version``, which prints the versions of the parts."""
 
@@ -266,6 +286,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "store": _from_module("store"),
     "candidates": _from_module("candidates"),
     "demo": _add_demo,
+    "try": _add_try,
     "version": _add_version,
 }
 

@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.cli import steps
 from tacpipe.errors import TacpipeError
-from tacpipe.io import terminal, termination
+from tacpipe.io import terminal
 from tacpipe.plugins import extras, registry
 
 if TYPE_CHECKING:
@@ -48,20 +49,8 @@ def run_rig(output: Path, rig_file: Path) -> Path:
 
 
 def _run(commands: list[list[str]]) -> None:
-    """Run commands in sequence and print each; the commands print their errors. Raises `TacpipeError` if one fails."""
     for command in commands:
-        terminal.note("$ tacpipe " + " ".join(command))
-        quiet = [] if command[0] == "show" else ["--quiet"]
-        process = subprocess.Popen([sys.executable, "-P", "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
-        with termination.reporting(""):  # The command itself reports interrupts.
-            try:
-                code = process.wait()
-            except KeyboardInterrupt:
-                process.terminate()
-                process.wait()
-                raise
-        if code:
-            raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {code}.")
+        steps.run(command, "The demo")
 
 
 def headline_of(result: Path) -> str:

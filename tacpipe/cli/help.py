@@ -54,7 +54,7 @@ SECTIONS = {  # commands in the order of ``tacpipe --help``; stages from other p
     "Prepare": ("extract", "synchronize", "segment", "split", "compress", "label"),
     "Train and evaluate": ("train", "calibrate", "recentre", "evaluate", "predict", "compare", "report", "track"),
     "Look": ("show", "check", "view", "explain", "candidates"),
-    "Manage": ("store", "demo", "version"),
+    "Manage": ("store", "demo", "try", "version"),
 }
 PLUG_INS = "Plug-ins"
 
