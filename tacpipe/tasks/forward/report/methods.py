@@ -12,7 +12,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Question, ScoreTable, Settings
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import from_parquet
 from tacpipe.report import context
@@ -234,7 +234,7 @@ def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
             objects = object_clusters(run, known_objects)
             cluster = headline.OBJECTS if objects else headline.RECORDINGS
             measure = headline.measure(steps, headline.unit_of_model(config), cluster)
-            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = PredictorErrors(
+            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = ScoreTable(
                 measure, by_predictor, objects
             )
     return ComparedRun(

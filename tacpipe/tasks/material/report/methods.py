@@ -10,7 +10,7 @@ import pandas as pd
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Kind, Question, ScoreTable, Settings
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
@@ -232,7 +232,7 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
         if classes:
             sums[headline.CHANCE] = dict.fromkeys(sums[predictions.MODEL], np.array([1 / classes, 1.0]))
         part = ", ".join(filter(None, (sensor_title(sensor), place)))
-        questions[Question(part, place=int(settings["elsewhere"]))] = PredictorErrors(
+        questions[Question(part, place=int(settings["elsewhere"]))] = ScoreTable(
             headline.MEASURE, {name: predictor_sums for name, predictor_sums in sums.items() if predictor_sums}
         )
     return ComparedRun(

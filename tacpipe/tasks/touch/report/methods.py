@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyArray, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Question, ScoreTable, Settings
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.plugins import params as params_of
 from tacpipe.report import context
@@ -203,7 +203,7 @@ def _run(run: TouchResult, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
             part = headline.PARTS[known_objects]
             if len(splits) > 1:
                 part += f", {describe_split(*run.split)}"
-            questions[Question(part, headline.TARGETS[target], rank)] = PredictorErrors(
+            questions[Question(part, headline.TARGETS[target], rank)] = ScoreTable(
                 measure, sums, None if known_objects else objects
             )
     return ComparedRun(
