@@ -39,7 +39,7 @@ REQUIREMENTS = Requirements(
 
 
 class ClassifyTask(LearnedTask):
-    """Name a label from touch."""
+    """Name the label of a touch, such as the object or whether a grasp is stable."""
 
     name = "classify"
     requirements = REQUIREMENTS

@@ -47,7 +47,7 @@ REQUIREMENTS = Requirements(
 
 
 class RegressTask(LearnedTask):
-    """Estimate quantities from touch."""
+    """Estimate forces, places and other quantities from touch."""
 
     name = "regress"
     requirements = REQUIREMENTS

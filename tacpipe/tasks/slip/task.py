@@ -59,7 +59,7 @@ REQUIREMENTS = Requirements(
 
 
 class SlipTask(Task):
-    """Predict slips of a held object."""
+    """Predict whether a held object slips within the next second."""
 
     name = "slip"
     requirements = REQUIREMENTS
