@@ -76,10 +76,8 @@ def test_all_four_targets_have_rows_and_the_papers_network_states_its_fraction(p
     folds, pointnet = grasps.folds[0], grasps.methods[1]
     schedule = published.schedule_parts(pointnet, folds, [Path("0/0"), Path("1/0")], quick=True)
     assert schedule == ["2 of 250 epochs", "250 of 750 points", "1 of 5 folds", "2 of 3 seeds"]
-    assert (
-        published.schedule_words(pointnet, folds, [Path(f"{s}/{f}") for s in range(3) for f in range(5)], quick=False)
-        == ""
-    )
+    complete = [Path(f"{seed}/{fold}") for seed in range(3) for fold in range(5)]
+    assert published.schedule_parts(pointnet, folds, complete, quick=False) == []
 
     comparisons = engine.compare([touch_fakes.result("pointnet", off=0.04)])
     rows = [published.result_cells("PointNet", each.best, each, "touch") for each in comparisons]

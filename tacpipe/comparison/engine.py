@@ -275,7 +275,7 @@ def _row(
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
     seeds = {seed for seed, _ in sums}
-    seed_scores = [measure.score_of(row for (own, _), row in sums.items() if own == seed) for seed in seeds]
+    seed_scores = [measure.score_of(row for (run_seed, _), row in sums.items() if run_seed == seed) for seed in seeds]
     gain = pairing.gain(measure, list(pairs.values()))
     return ComparisonRow(
         name,

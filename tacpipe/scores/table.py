@@ -45,6 +45,8 @@ class ScoreTable:
     # error sums (part,), as defined by `measure`, by predictor and recording
     sums: Mapping[str, Mapping[str, AnyFloats]]
     clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None if each is its own
+    # predictors that are baselines of headlines, and their names there; None: all but the model
+    baselines: Mapping[str, str] | None = None
 
     @classmethod
     def from_rows(
@@ -65,7 +67,7 @@ class ScoreTable:
 
     def sums_of(self, predictor: str) -> Sums:
         """Return the sums of a predictor as those of a run with one seed."""
-        return {(0, recording): sums for recording, sums in self.sums[predictor].items()}
+        return {(0, recording): sums for recording, sums in self.sums.get(predictor, {}).items()}
 
     def score(self, predictor: str) -> Estimate:
         """Return the score of a predictor with its interval."""
@@ -77,7 +79,10 @@ class ScoreTable:
 
     def headline(self, task: str, method: str, question: Question) -> Headline | None:
         """Return the comparison of the model with its baselines, or None if it has no recordings."""
-        baselines = {name.replace("_", " "): self.sums_of(name) for name in self.sums if name != MODEL}
+        names = self.baselines
+        if names is None:
+            names = {name: name.replace("_", " ") for name in self.sums if name != MODEL}
+        baselines = {text: self.sums_of(name) for name, text in names.items() if self.sums.get(name)}
         return pairing.headline(
             task,
             method,
