@@ -75,7 +75,7 @@ docs: $(VENV)/.docs ## build the documentation as a site into .cache/site
 pictures: demo #- draw the pictures of the documentation, that of the front page from the demo's report
 	@$(BIN)/python docs/pictures.py demo/report.html
 
-benchmark: $(VENV)/.dev ## measure every published set in DATA next to the numbers of its paper, in days; OPTIONS=--quick takes minutes
+benchmark: $(VENV)/.dev #- measure every published set in DATA next to the numbers of its paper, in days; OPTIONS=--quick takes minutes
 	@$(BIN)/python benchmarks/published.py $(DATA) $(OPTIONS)
 
 learning-curve: $(VENV)/.dev #- measure what more recordings are worth to forward, on the dataset of segments DATA; OPTIONS="--draws 2"; minutes to hours
