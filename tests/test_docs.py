@@ -330,6 +330,12 @@ def test_the_tables_of_results_are_on_the_page_and_have_their_picture() -> None:
         assert rows[0]["method"] in page and f"images/{name}.png" in page
 
 
+def test_lists_of_tasks_and_formats_are_those_of_the_registry() -> None:
+    page = hooks().on_page_markdown("[[list: tasks]]\n\n[[list: formats]]\n")
+    assert all(f"[`{task}`](tasks/{task}.md)" in page for task in registry.tasks())
+    assert all(f"`{name.replace('.', ' ')}`" in page for name in BUILT_IN if name.startswith("ingest."))
+
+
 PARSED = {  # beginnings of examples of the help that are parsed and not run, and why
     "acquire": "needs the devices of a rig",
     "candidates": "names a published grasp",
