@@ -54,7 +54,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help help-all demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-paged test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits broken-data fuzz test-kernel check lint types bless bench clean
+.PHONY: help help-all demo rig-demo live-demo wheel docs pictures benchmark learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-paged test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits broken-data fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets that people use
 	@grep -E '^[a-z-]+:.* ## ' $(MAKEFILE_LIST) | sed -E 's/:.* ## /\t/' | expand -t 16
@@ -75,8 +75,8 @@ docs: $(VENV)/.docs ## build the documentation as a site into .cache/site
 pictures: demo #- draw the pictures of the documentation, that of the front page from the demo's report
 	@$(BIN)/python docs/pictures.py demo/report.html
 
-result-pages: $(VENV)/.dev #- compute the three result pages of a release from the published sets in DATA, in hours; dist/results
-	@$(BIN)/python docs/result_pages.py $(DATA)
+benchmark: $(VENV)/.dev #- measure every published set in DATA next to the numbers of its paper, in days; OPTIONS=--quick takes minutes
+	@$(BIN)/python benchmarks/published.py $(DATA) $(OPTIONS)
 
 learning-curve: $(VENV)/.dev #- measure what more recordings are worth to forward, on the dataset of segments DATA; OPTIONS="--draws 2"; minutes to hours
 	@$(BIN)/python docs/learning_curve.py $(DATA) $(OPTIONS)

@@ -1,4 +1,4 @@
-"""Generate documentation pages: the command line, params of stages, Python, decisions and result tables.
+"""Generate documentation pages: the command line, params of stages, Python, decisions, lists and result tables.
 
 mkdocs calls ``on_files`` and ``on_page_markdown``; tests call the functions that return pages.
 """
@@ -31,7 +31,7 @@ BASE_CLASSES = {  # base class -> page with a complete example
     "tacpipe.trackers.tracking.Tracker": "tracker",
     "tacpipe.engine.executors.local.Executor": "executor",
 }
-TABLE = re.compile(r"^\[\[results: (\w+)\]\]$", re.MULTILINE)
+TABLE = re.compile(r"^\[\[(results|list): (\w+)\]\]$", re.MULTILINE)
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -44,10 +44,11 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
-    """Insert the tables of results at ``[[results: NAME]]``, and leave decisions out of the search index."""
+    """Insert tables at ``[[results: NAME]]`` and ``[[list: NAME]]``, and leave decisions out of the search index."""
     if page is not None and page.file.src_uri.startswith("decisions/"):
         page.meta["search"] = {"exclude": True}
-    return TABLE.sub(lambda match: result_table(match.group(1)), markdown)
+    tables = {"results": result_table, "list": list_table}
+    return TABLE.sub(lambda match: tables[match.group(1)](match.group(2)), markdown)
 
 
 def pages() -> dict[str, str]:
@@ -60,6 +61,21 @@ def pages() -> dict[str, str]:
         "reference/live-messages.md": live_messages(),
         "decisions/index.md": decisions(),
     }
+
+
+def list_table(name: str) -> str:
+    """Return the table of all ``tasks``, or of all ``formats`` that ``tacpipe ingest`` reads, from the registry."""
+    from tacpipe.plugins import registry
+
+    if name == "tasks":
+        rows = [
+            f"| [`{task}`](tasks/{task}.md) | {type(registry.load_task(task)).__doc__.splitlines()[0]} |"
+            for task in registry.tasks()
+        ]
+        return "\n".join(["| task | what a model does |", "| --- | --- |", *rows])
+    formats = [stage for stage in stage_names() if stage.startswith("ingest.")]
+    rows = [f"| `{stage.replace('.', ' ')}` | {registry.summary(stage)} |" for stage in formats]
+    return "\n".join(["| command | purpose |", "| --- | --- |", *rows])
 
 
 def live_messages() -> str:

@@ -23,6 +23,7 @@ from tacpipe.scores import intervals, pairing
 from tacpipe.scores.headline import MIN_CLUSTERS
 from tacpipe.scores.intervals import wilson
 from tacpipe.scores.pairing import Measure
+from tacpipe.scores.table import ScoreTable
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.slip import metrics as slip
@@ -289,7 +290,8 @@ def area_coverage(objects: int, area: float, repeats: int = REPEATS) -> AreaCove
             windows.sums("before", layout, np.zeros(len(windows.scores)))
             for windows in map(slip.WindowScores, draw_scores(rng, objects, models))
         )
-        estimates = pairing.score(measure, model), pairing.difference(measure, model, baseline)
+        table = ScoreTable(measure, {"model": model, "baseline": baseline})
+        estimates = table.score("model"), table.gain_over("baseline")
         for column, (estimate, truth) in enumerate(zip(estimates, truths, strict=True)):
             if np.isfinite(estimate.low):
                 covered[repeat, column] = estimate.low <= truth <= estimate.high

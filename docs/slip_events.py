@@ -18,10 +18,11 @@ import numpy as np
 import tacpipe
 from tacpipe.arrays import Floats, Times
 from tacpipe.datasets.dataset import Recording
+from tacpipe.scores.table import MODEL
 from tacpipe.tasks.learning.features import ChannelAxes
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
-from tacpipe.tasks.slip.evaluation import MODEL, EvaluatedSlips
+from tacpipe.tasks.slip.evaluation import EvaluatedSlips
 
 RATES = ("1", "10")  # false alarms per minute that levels are set for
 CONTRASTS = {  # windows before a slip of these handlings, against stable contact of those
@@ -43,8 +44,11 @@ def lines(data: Path, models: Sequence[Path], results: Sequence[Path]) -> Iterat
     yield "| --- | --- | --- | --- |"
     for name, (slips, stable) in CONTRASTS.items():
         chosen = select(pooled, [handling[track.name] in (*slips, *stable) for track in pooled.tracks])
-        areas = [metrics.areas(metrics.WindowScores(chosen.scored_by(predictor))) for predictor in (MODEL, "time_only")]
-        cells = [areas[0]["before"], areas[0]["during"], areas[1]["before"]]
+        tables = chosen.tables()
+        estimates = (
+            tables[part].score(name) for part, name in (("before", MODEL), ("during", MODEL), ("before", "time_only"))
+        )
+        cells = [metrics.to_json(estimate) for estimate in estimates]
         yield f"| {name} | " + " | ".join(map(estimate_text, cells)) + " |"
     yield ""
     heads = [

@@ -50,6 +50,24 @@ def listed(names: Iterable[object], max_names: int = 8) -> str:
     return (", ".join(texts[:max_names]) or "none") + suffix
 
 
+def format_count(count: int, plural: str) -> str:
+    """Return a count with its noun, singular for 1; thousands are separated.
+
+    >>> format_count(1, "recordings"), format_count(1200, "slides")
+    ('1 recording', '1,200 slides')
+    """
+    return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
+
+
+def round_to(value: float, digits: int) -> float:
+    """Return a value with some significant digits.
+
+    >>> round_to(123.456, 4), round_to(0.000123456, 2)
+    (123.5, 0.00012)
+    """
+    return float(f"{value:.{digits}g}")
+
+
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a sentence, with a space before it, that suggests the most similar of ``names``; "" if none is similar.
 

@@ -1,8 +1,6 @@
 """Texts and help are true: commands run as printed, paths exist, examples parse."""
 
-import csv
 import importlib.util
-import io
 import json
 import os
 import re
@@ -16,7 +14,6 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import yaml
 
 from tacpipe.cli import commands
 from tacpipe.plugins import params as params_of
@@ -325,77 +322,18 @@ def test_the_tables_of_results_are_on_the_page_and_have_their_picture() -> None:
     tables = sorted(path.stem for path in (ROOT / "docs" / "results").glob("*.csv"))
     page = documentation.on_page_markdown(text)
 
-    assert tables == ["forward", "material", "touch"]
-    for name in tables:
+    assert tables == ["forward", "material", "published", "touch"]
+    for name in module("pictures").TITLES:
         rows = module("pictures").rows(name)
         assert 3 <= len(rows) <= 7
         assert all(float(row["low"]) <= module("pictures").value_of(row) <= float(row["high"]) for row in rows)
         assert rows[0]["method"] in page and f"images/{name}.png" in page
 
 
-def test_the_params_of_the_result_pages_are_of_published_recordings(tmp_path: Path) -> None:
-    pages = module("result_pages")
-    params = yaml.safe_load((ROOT / "params.yaml").read_text())
-    for name in ("bleach", "spam"):
-        (tmp_path / "vision2tactile" / name).mkdir(parents=True)
-    published = pages.published(params, tmp_path)
-
-    assert "simulate" not in " ".join([published["forward"]["recordings"], published["touch"]["recordings"]])
-    assert published["forward"]["synchronize"]["grid"] == "logged" and set(published["material"]["sources"]) == {
-        "biotac",
-        "roboskin",
-    }
-    assert published["material"]["split"]["scheme"] == "authors" and "folds" not in published["material"]["split"]
-    assert published["touch"]["objects"] == [0, 1]
-    assert published["touch"]["quick"]["methods"]["pointnet"]["wrist"] == "estimated"
-    assert params["forward"]["recordings"].startswith("simulate")
-
-
-def test_reduced_params_have_one_fold_one_epoch_and_one_method_and_splits_stay() -> None:
-    import yaml
-
-    params = yaml.safe_load((ROOT / "params.yaml").read_text())
-    reduced = module("result_pages").reduced(params)
-    assert reduced["touch"]["methods"] == params["touch"]["methods"][:1] and reduced["forward"]["folds"] == [0]
-    assert reduced["forward"]["quick"]["methods"]["gru"]["epochs"] == 1
-    assert reduced["forward"]["split"] == params["forward"]["split"]
-    assert params["forward"]["quick"]["methods"]["gru"]["epochs"] == 10
-
-
-def test_the_tables_of_results_are_made_from_results() -> None:
-    from tacpipe.comparison import engine
-    from tests.tasks.touch.report.touch_fakes import result
-
-    short = result("pointnet", off=0.05)
-    short.files["config.json"] = short.files["config.json"].replace(b'"epochs": 250', b'"epochs": 15')
-    text = module("result_pages").table(engine.compare([result("trees", off=0.02), short]))
-    rows = list(csv.DictReader(io.StringIO(text)))
-    assert list(rows[0]) == ["method", "target", "skill", "low", "high", "grasps"]
-    targets = ("PDC thumb", "PDC middle finger", "electrodes thumb", "electrodes middle finger")
-    methods = (("trees on geometry and colour", "0.800"), ("PointNet (paper's network, 15 of 250 epochs)", "0.500"))
-    assert [(row["method"], row["target"], row["skill"]) for row in rows] == [
-        *((method, target, skill) for target in targets for method, skill in methods),
-        ("constant", "all", "0"),
-    ]
-
-
-def test_the_table_of_materials_states_shares_of_slides_with_wilson_s_interval() -> None:
-    from tacpipe.comparison import engine
-    from tacpipe.scores.intervals import wilson
-    from tests.tasks.material.report import material_fakes
-
-    results = [
-        material_fakes.result("minirocket", wrong={"biotac": 1}, also={"mean_level": {"biotac": 4}}),
-        material_fakes.result("raec", wrong={"biotac": 2}, epochs=150),
-    ]
-    rows = list(csv.DictReader(io.StringIO(module("result_pages").table(engine.compare(results)))))
-    assert list(rows[0]) == ["method", "sensor", "accuracy_percent", "low", "high", "slides"]
-    slides = int(rows[0]["slides"])
-    for row, right in zip(rows, (slides - 1, slides - 2, slides - 4), strict=False):
-        low, high = wilson(right, slides)
-        values = [f"{100 * value:.1f}" for value in (right / slides, low, high)]
-        assert [row["accuracy_percent"], row["low"], row["high"]] == values
-    assert (rows[-1]["method"], rows[-1]["accuracy_percent"]) == ("chance", f"{100 / material_fakes.MATERIALS:.1f}")
+def test_lists_of_tasks_and_formats_are_those_of_the_registry() -> None:
+    page = hooks().on_page_markdown("[[list: tasks]]\n\n[[list: formats]]\n")
+    assert all(f"[`{task}`](tasks/{task}.md)" in page for task in registry.tasks())
+    assert all(f"`{name.replace('.', ' ')}`" in page for name in BUILT_IN if name.startswith("ingest."))
 
 
 PARSED = {  # beginnings of examples of the help that are parsed and not run, and why

@@ -15,12 +15,12 @@ from tacpipe.arrays import AnyArray
 from tacpipe.checks.check import Check, CheckFinding, Stream
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import NAME
-from tacpipe.datasets.overview import NO_SIGNALS, counted
+from tacpipe.datasets.overview import NO_SIGNALS
 from tacpipe.errors import UsageError
 from tacpipe.io import JsonObject, regular, terminal
 from tacpipe.io.files import readable_errors, write_whole
 from tacpipe.plugins import registry
-from tacpipe.printable import grouped_failures, lines, listed
+from tacpipe.printable import format_count, grouped_failures, lines, listed
 
 ACCEPTED = ".accepted.json"  # end of the name of the file beside a dataset
 _EMPTY: JsonObject = {"schema_version": 1, "accepted": {}}
@@ -61,10 +61,9 @@ class Examination:
         """Return the answer, then two lines per finding; accepted ones come last, with one line each."""
         remaining = self.open_findings
         accepted = [finding for finding in self.findings if finding not in remaining]
-        count = counted(len(self.findings), "finding")
-        answer = (
-            f"{count} in {counted(self.recordings, 'recording')}{f', {len(accepted)} accepted' if accepted else ''}"
-        )
+        count = format_count(len(self.findings), "findings")
+        suffix = f", {len(accepted)} accepted" if accepted else ""
+        answer = f"{count} in {format_count(self.recordings, 'recordings')}{suffix}"
         texts = [answer]
         for finding in remaining:
             texts += [f"{finding.id}: {finding.sentence} {finding.place()}", f"    repair: {finding.repair}"]

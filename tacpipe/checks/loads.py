@@ -12,7 +12,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.checks.check import EXCLUDE, LOADS, Check, CheckFinding, Stream, StreamName, quantity
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.overview import counted
+from tacpipe.printable import format_count
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -117,7 +117,9 @@ def _lag_finding(pair: tuple[str, str], lag: Lag, lags: Mapping[str, tuple[Lag, 
     later, earlier = pair[::-1] if lag.lag_s > 0 else pair
     low_s, high_s = sorted((abs(lag.low_s), abs(lag.high_s)))
     interval = f"{low_s:.2f} to {high_s:.2f} s"
-    sentence = f"{later} is {abs(lag.lag_s):.2f} s ({interval}) behind {earlier} in {counted(len(lags), 'recording')}."
+    sentence = (
+        f"{later} is {abs(lag.lag_s):.2f} s ({interval}) behind {earlier} in {format_count(len(lags), 'recordings')}."
+    )
     repair = f"[streams.{later}] time: offset_s = {-abs(lag.lag_s):.2f}"
     content = [shard for _, shards in lags.values() for shard in shards]
     return CheckFinding("lag", f"{later} behind {earlier}", sentence, repair, dict.fromkeys(lags, ()), content)

@@ -82,10 +82,11 @@ EMULATED = "emulated"  # folder of the rig file written by the emulation
 
 
 def demo_commands(output: Path) -> list[list[str]]:
-    """Return the commands of all tasks' demos and of the results page, without the leading ``tacpipe``."""
+    """Return the commands of all tasks' demos, each once, and of the results page, without the leading ``tacpipe``."""
     demos = demo_parts(output)
     results = [name for demo in demos for name in demo.results]
-    return [*(words for demo in demos for words in demo.commands), ["report", *results, "-o", str(demo_page(output))]]
+    commands = dict.fromkeys(tuple(words) for demo in demos for words in demo.commands)
+    return [*map(list, commands), ["report", *results, "-o", str(demo_page(output))]]
 
 
 def demo_rig(output: Path) -> list[list[str]]:

@@ -17,7 +17,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import Scalar, terminal
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import StoredParams, Values
-from tacpipe.scores import headline, words
+from tacpipe.printable import format_count
+from tacpipe.scores import headline
 from tacpipe.store.store import Store
 from tacpipe.training.following import Line
 
@@ -172,7 +173,7 @@ def _summary(value: Mapping[str, Any]) -> str:
     """Return architecture, task, number of epochs and validation result on one line, without those that are missing."""
     parts = [f"{value['architecture'] or 'a model'} for {value['task']}"]
     if value["epochs"]:
-        parts.append(words.format_count(value["epochs"], "epochs"))
+        parts.append(format_count(value["epochs"], "epochs"))
     if value["validation"]:
         parts.append(f"validation: {flat(value['validation'])}")
     return "; ".join(parts)
@@ -201,7 +202,7 @@ def _count_training(trained: TrainingCounts) -> list[str]:
         for role, counts in trained["roles"].items()
     ]
     count = trained["recordings"]
-    return [*lines, *([words.format_count(count, "recordings") + " of training and validation"] if count else [])]
+    return [*lines, *([format_count(count, "recordings") + " of training and validation"] if count else [])]
 
 
 def _inputs(inputs: Mapping[str, Sequence[InputDataset]], store: Store) -> dict[str, list[str]]:

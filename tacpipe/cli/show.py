@@ -28,8 +28,8 @@ from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.rows import TABLE_HEADS, table_of_rows
 from tacpipe.plugins.stage import ROLES, Attribute, StoredParams
+from tacpipe.printable import format_count
 from tacpipe.recording import spool_folders
-from tacpipe.scores.words import format_count
 from tacpipe.store.location import locate
 from tacpipe.store.store import Store
 

@@ -18,8 +18,7 @@ from tacpipe.datasets.intervals import all_intervals
 from tacpipe.errors import UsageError
 from tacpipe.io.terminal import RowGroup, TerminalRow, TerminalTable
 from tacpipe.plugins.stage import Attribute
-from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
-from tacpipe.scores.words import format_count
+from tacpipe.printable import WALL_CLOCK_NS, format_count, listed, plain, shown
 
 if TYPE_CHECKING:
     import pyarrow as pa

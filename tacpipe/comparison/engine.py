@@ -47,7 +47,7 @@ class ComparisonRow:
     method: Method  # method whose runs include the question
     values: tuple[float, ...]  # one value per column of the comparison
     score: Estimate  # score drawn in charts
-    spread: float  # standard deviation of the score over runs; NaN for a single run
+    spread: float  # standard deviation of the score over seeds; NaN for a single seed
     baseline: str  # best baseline on the same recordings; empty for baselines, and if none was evaluated
     gain: Gain  # gain over the baseline
     p: float  # p value for equality with the baseline (`pairing.swap_test`), not corrected for the number of methods
@@ -274,7 +274,8 @@ def _row(
     """
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
-    run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
+    seeds = {seed for seed, _ in sums}
+    seed_scores = [measure.score_of(row for (run_seed, _), row in sums.items() if run_seed == seed) for seed in seeds]
     gain = pairing.gain(measure, list(pairs.values()))
     return ComparisonRow(
         name,
@@ -284,14 +285,14 @@ def _row(
         method,
         measure.values(sum(sums.values())),  # type: ignore[arg-type]
         pairing.score(measure, sums, clusters),
-        spread(run_scores).sd,
+        spread(seed_scores).sd,
         next(iter(pairs), ""),
         gain,
         next((compared.p for compared in pairs.values()), math.nan),
         gain.clusters or len({clusters[name] if clusters else name for _, name in sums}),
         len({recording for _, recording in sums}),
         len(runs),
-        len({seed for seed, _ in sums}),
+        len(seeds),
     )
 
 

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Generic, Literal
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
 from tacpipe.datasets.selection import is_simulated
 from tacpipe.io import Scalar
 from tacpipe.plugins import registry
 from tacpipe.scores import pairing
-from tacpipe.scores.pairing import Measure, Sums
+from tacpipe.scores.pairing import Sums
+from tacpipe.scores.table import MODEL as MODEL
+from tacpipe.scores.table import Question as Question
+from tacpipe.scores.table import ScoreTable as ScoreTable
 
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
@@ -32,7 +34,7 @@ Reading = TypeVar("Reading", bound="TaskResults")
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and standard deviation over runs; the latter is NaN for a single one."""
+    """Mean and standard deviation, of one value per seed; the latter is NaN for a single one."""
 
     mean: float
     sd: float
@@ -105,34 +107,6 @@ def marks(differing: Settings) -> list[str]:
     return texts
 
 
-MODEL = "model"  # name of a run's own predictor
-
-
-@dataclass(frozen=True)
-class Question:
-    """The subject of a comparison: recordings ("unseen objects"), and one of several targets ("PDC thumb"), as text."""
-
-    part: str = ""
-    target: str = ""
-    place: int = 0  # order among the questions of a task; 0 is the main question
-
-    @property
-    def where(self) -> str:
-        """Part and target as text."""
-        return ", ".join(filter(None, (self.target, self.part))) or "all recordings"
-
-
-@dataclass(frozen=True)
-class PredictorErrors:
-    """Errors of a run's predictors on one question."""
-
-    measure: Measure
-    sums: Mapping[
-        str, Mapping[str, AnyFloats]
-    ]  # error sums (part,), as defined by `measure`, by predictor and recording
-    clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None if each is its own
-
-
 @dataclass(frozen=True, eq=False)
 class ComparedRun(Generic[Details]):
     """One result: a model trained once and evaluated once."""
@@ -141,7 +115,7 @@ class ComparedRun(Generic[Details]):
     task: str
     method: str  # name of all runs that differ only in settings
     settings: Settings  # settings that define the method; neither seed nor fold
-    questions: Mapping[Question, PredictorErrors]
+    questions: Mapping[Question, ScoreTable]
     family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None

@@ -17,8 +17,7 @@ from tacpipe.io.terminal import WIDTH, RowGroup, TerminalRow, TerminalTable
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import Attribute, ParamValue, StoredParams
-from tacpipe.printable import listed
-from tacpipe.scores.words import format_count
+from tacpipe.printable import format_count, listed
 from tacpipe.store import records
 from tacpipe.store.location import locate
 from tacpipe.store.records import Content, Provenance, RecordingEntry, RunIdentity

@@ -12,7 +12,7 @@ from tacpipe.channels import streams
 from tacpipe.channels.schema import TRUTH
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError
-from tacpipe.printable import listed
+from tacpipe.printable import format_count, listed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -157,16 +157,7 @@ def _streams(recording: ReadableRecording) -> str:
 
 def _size(table: pa.Table) -> str:
     rate_hz = streams.rate_hz(table) if "t_ns" in table.column_names else 0
-    return f"{f'{rate_hz:g} Hz, ' if rate_hz else ''}{counted(table.num_columns, 'column')}"
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun.
-
-    >>> counted(1, "column"), counted(2, "column")
-    ('1 column', '2 columns')
-    """
-    return f"{count} {noun}{'s' if count != 1 else ''}"
+    return f"{f'{rate_hz:g} Hz, ' if rate_hz else ''}{format_count(table.num_columns, 'columns')}"
 
 
 def _labels(dataset: ReadableDataset) -> str:

@@ -378,21 +378,3 @@ def leaves(tree: JsonObject) -> dict[str, str]:
         else:
             texts[name] = NONE if value is None else json.dumps(value)
     return texts
-
-
-def counted(count: int, plural: str) -> str:
-    """Return a count with its noun, singular for 1; thousands are separated.
-
-    >>> counted(1, "recordings"), counted(1200, "slides")
-    ('1 recording', '1,200 slides')
-    """
-    return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names joined as in a sentence.
-
-    >>> listed(["a", "b", "c"]), listed(["a"]), listed([])
-    ('a, b and c', 'a', '')
-    """
-    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)

@@ -15,7 +15,8 @@ from tacpipe.comparison.runs import by_task, report_on
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import extras
-from tacpipe.report.blocks import Block, Chart, Charts, Fold, Section, listed
+from tacpipe.printable import listed
+from tacpipe.report.blocks import Block, Chart, Charts, Fold, Section
 from tacpipe.report.context import TaskReport
 from tacpipe.report.frames import holds_cameras
 from tacpipe.report.sections import section

@@ -35,7 +35,7 @@ class PrintedNumber:
         """Return whether a row is of the same method: a competing one, unless there are settings."""
         return (
             row.predictor == self.predictor
-            and row.method.family == self.family
+            and self.family in ("", row.method.family)
             and (bool(self.settings) or not row.method.control)
             and all(row.method.settings.get(name) == value for name, value in self.settings.items())
         )

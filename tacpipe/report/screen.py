@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, ComparisonRow
+from tacpipe.printable import format_count
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Table, counted, number
+from tacpipe.report.blocks import NONE, Cell, Chart, Table, number
 from tacpipe.report.blocks import table as table_of
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context
@@ -46,7 +47,7 @@ def sentence(context: Context) -> tuple[str, str]:
         return "", ""
     text = "; ".join(clauses[:2])
     verdict = verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
-    return f"{_capital(text)}.", verdict
+    return f"{words.capitalize(text)}.", verdict
 
 
 def first_chart(context: Context) -> Chart | None:
@@ -87,7 +88,7 @@ def first_chart(context: Context) -> Chart | None:
     if any(row["off"] or row["on_left"] or row["on_right"] for row in spec["data"]["values"]):
         drawn.append("triangles: beyond the axis")
     caption = f"{'; '.join(drawn)}. Values further to the {better} are better."
-    return Chart(_capital(f"{measure.scored}{part}"), spec, caption)
+    return Chart(words.capitalize(f"{measure.scored}{part}"), spec, caption)
 
 
 def with_unit(quantity: str) -> str:
@@ -137,7 +138,7 @@ def first_table(context: Context) -> Table | None:
         kinds[0] = "best"
     remaining = len({row.name for comparison in first_comparisons for row in comparison.models}) - len(names)
     title = "Best methods and the best baseline" + (
-        f"; {counted(remaining, 'more methods')} below" if remaining > 0 else ""
+        f"; {format_count(remaining, 'more methods')} below" if remaining > 0 else ""
     )
     return table_of(title, heads, rows, kinds)
 
@@ -166,7 +167,7 @@ def _table_by_target(context: Context, parts: dict[str, list[Comparison]], targe
             ]
         rows.append(cells)
     measure = next(iter(parts.values()))[0].measure
-    return table_of(f"{_capital(measure.columns[0])} by target, next to the best baseline", heads, rows)
+    return table_of(f"{words.capitalize(measure.columns[0])} by target, next to the best baseline", heads, rows)
 
 
 def gain_cell(measure: Measure, gain: Gain) -> Cell:
@@ -226,7 +227,3 @@ def _cells(comparison: Comparison, row: ComparisonRow | None, single: bool) -> l
     count = [Cell(f"{row.n:,}", value=row.n)] if single else []
     compared = gain_cell(comparison.measure, row.gain) if row.baseline else Cell("")
     return [*(errors[-2:] if single else errors[-1:]), compared, *count]
-
-
-def _capital(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}"

@@ -13,6 +13,7 @@ from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, grouped
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import is_simulated
+from tacpipe.printable import format_count
 from tacpipe.report import blocks, charts, context, frames, screen
 from tacpipe.report.blocks import (
     NONE,
@@ -23,7 +24,6 @@ from tacpipe.report.blocks import (
     Section,
     SmallPrint,
     Table,
-    counted,
     fold,
     number,
     p_value,
@@ -139,7 +139,7 @@ def method_folds(context: Context) -> list[Fold]:
         else "",
         "A number after a name is the number of other methods in its family.",
     )
-    return fold("All methods and baselines", *tables, note, about=counted(len(context.methods), "methods"))
+    return fold("All methods and baselines", *tables, note, about=format_count(len(context.methods), "methods"))
 
 
 def headline_caption(measure: Measure) -> str:
@@ -172,7 +172,7 @@ def _table(context: Context, comparison: Comparison) -> Table:
     measure = comparison.measure
     scored = [] if _score_column(comparison) is not None else [measure.scored]
     gained = f"{words.GAINS[measure.name]} than the best baseline"
-    heads = ["", *map(words.format_column, measure.columns), *scored, "sd over runs", gained]
+    heads = ["", *map(words.format_column, measure.columns), *scored, "sd over seeds", gained]
     heads += ["best baseline", "p", *(head for head, _ in task_columns), *_counts_of(comparison, comparison.rows[0])]
     return Table(comparison.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
@@ -327,7 +327,7 @@ def run_folds(context: Context) -> list[Fold]:
     for comparison in context.comparisons:
         heads += [f"{comparison.question.where}: {comparison.measure.scored}", "recordings"]
     heads += ["epochs", *context.task.run_columns(context.runs[0])]
-    return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
+    return fold("Every run", blocks.table("", heads, rows), about=format_count(len(rows), "runs"))
 
 
 def basis_folds(context: Context) -> list[Fold]:
@@ -355,13 +355,13 @@ def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
     """Return the counts of methods, results (if there are several) and clusters, such as "40 recordings"."""
     counts = []
     if context.methods:
-        counts.append(counted(len(context.methods), "methods"))
+        counts.append(format_count(len(context.methods), "methods"))
     if len(results) > 1:
-        counts.append(counted(len(results), "results"))
+        counts.append(format_count(len(results), "results"))
     clusters: set[str] = set()
     for run in context.runs:
         for errors in run.questions.values():
             clusters.update((errors.clusters or {}).get(name, name) for name in errors.sums.get(MODEL, {}))
     if clusters:
-        counts.append(counted(len(clusters), context.comparisons[0].measure.cluster))
+        counts.append(format_count(len(clusters), context.comparisons[0].measure.cluster))
     return counts

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tacpipe.printable import listed
+from tacpipe.printable import format_count, listed
 from tacpipe.scores.headline import BETTER, MIN_CLUSTERS, NO_VERDICT, UNCLEAR, WORSE, Headline, weakest
 
 NONE = "–"
@@ -32,7 +32,7 @@ SKILL_OVER = "vs "  # column "vs X" contains 1 − error / error of X
 
 def sentence(headline: Headline) -> str:
     """Return the comparison with the best baseline as a sentence, as certain as the interval allows."""
-    return f"{_capitalize(headline.where)}: {headline.method} {clause(headline)}."
+    return f"{capitalize(headline.where)}: {headline.method} {clause(headline)}."
 
 
 def summary(headlines: Sequence[Headline]) -> list[str]:
@@ -177,11 +177,6 @@ def number(value: float) -> str:
     return (f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}").replace("-", "−")
 
 
-def format_count(count: int, plural: str) -> str:
-    """Format a count with its noun."""
-    return f"{count:,} {plural.removesuffix('s') if count == 1 else plural}"
-
-
 def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of a table of headlines, which must have the same columns.
 
@@ -244,6 +239,6 @@ def _omission_note(headlines: Sequence[Headline]) -> str:
     )
 
 
-def _capitalize(words: str) -> str:
+def capitalize(words: str) -> str:
     """Return words with a capital first letter; the name of a column stays as it is."""
     return words if "_" in words.split()[0] else words[:1].upper() + words[1:]

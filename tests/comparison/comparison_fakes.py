@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
+from tacpipe.comparison.runs import ComparedRun, Question, ScoreTable
 from tacpipe.scores.pairing import Measure
 
 QUESTION = Question("known")
@@ -43,7 +43,7 @@ def run(
     **about: Any,
 ) -> ComparedRun:
     """A run of predictors with these errors by recording."""
-    measured = PredictorErrors(MEAN, {name: sums(values) for name, values in errors.items()}, clusters)
+    measured = ScoreTable(MEAN, {name: sums(values) for name, values in errors.items()}, clusters)
     settings = about.pop("settings", {})
     return ComparedRun(
         about.pop("dataset", None), "weighing", method, settings, {question: measured}, seed=seed, **about

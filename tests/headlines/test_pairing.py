@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tacpipe.channels import biotac_sp
 from tacpipe.cli import headline_table
 from tacpipe.scores import headline, pairing, regression, words
+from tacpipe.scores.table import Question
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.touch import headline as touch
@@ -27,13 +29,22 @@ def forecasts(ratios: dict[str, float], *, seed: int = 0, persistence: float = 1
     }
 
 
+def compared_forecasts(model: Any, baselines: dict[str, Any]) -> headline.Headline | None:
+    """Return the comparison of forecasts, which may have several seeds."""
+    return pairing.headline("forward", "net", forward.measure((1,)), model, baselines)
+
+
 def test_the_best_baseline_is_that_of_least_error_and_controls_and_codecs_are_none() -> None:
     model = forecasts(dict.fromkeys(RECORDINGS, 0.5))
     baselines = {
         name: forecasts(dict.fromkeys(RECORDINGS, ratio)) for name, ratio in (("persistence", 1.0), ("ridge", 0.4))
     }
     bounds = {name: forecasts(dict.fromkeys(RECORDINGS, 0.1)) for name in ("codec", "codec_anchored", "model_anchored")}
-    result = forward.headline("net", (1,), model, {**baselines, **bounds}, None)
+    sums = {
+        name: {recording: row for (_, recording), row in rows.items()}
+        for name, rows in {"model": model, **baselines, **bounds}.items()
+    }
+    result = forward.score_table((1,), sums).headline("forward", "net", Question())
     assert result is not None and result.best is not None
     assert [baseline.name for baseline in result.baselines] == ["ridge", "persistence"]
     assert result.gain == pytest.approx(1 - 0.5 / 0.4)
@@ -49,7 +60,7 @@ def test_the_interval_is_that_of_students_t_for_the_logarithm_of_the_ratio_of_er
          for key, value in forecasts({name: ratio}, persistence=by).items()}
         for method_ratios in ratios
     )  # fmt: skip
-    result = forward.headline("net", (1,), model, {"ridge": ridge}, None)
+    result = compared_forecasts(model, {"ridge": ridge})
     logs = np.log(ratios[0] / ratios[1])  # however large the recordings are
     ends = stats.t.interval(0.95, 11, logs.mean(), stats.sem(logs))
     assert result is not None
@@ -59,30 +70,30 @@ def test_the_interval_is_that_of_students_t_for_the_logarithm_of_the_ratio_of_er
 
 def test_a_baseline_counts_on_the_recordings_that_it_shares_with_the_model() -> None:
     model = forecasts({"a": 0.5, "b": 0.1})
-    result = forward.headline("net", (1,), model, {"ridge": forecasts({"a": 0.4, "z": 9.0})}, None)
+    result = compared_forecasts(model, {"ridge": forecasts({"a": 0.4, "z": 9.0})})
     assert result is not None
     assert result.clusters == 1
     assert result.gain == pytest.approx(1 - 0.5 / 0.4)
-    without_shared = forward.headline("net", (1,), model, {"ridge": forecasts({"z": 1.0})}, None)
+    without_shared = compared_forecasts(model, {"ridge": forecasts({"z": 1.0})})
     assert without_shared is not None and without_shared.best is None
 
 
 def test_where_persistence_never_errs_nothing_is_relative_to_it() -> None:
     model = forecasts(dict.fromkeys(RECORDINGS, 0.5), persistence=0.0)
-    result = forward.headline("net", (1,), model, {"persistence": model}, None)
+    result = compared_forecasts(model, {"persistence": model})
     assert result is not None and result.verdict == "" and np.isnan(result.gain)
 
 
 def test_the_gain_in_accuracy_is_in_points_and_chance_is_a_baseline_too() -> None:
-    slides = [(0, f"s{index}") for index in range(20)]
-    right = {"model": {key: (int(at < 18), 1) for at, key in enumerate(slides)}}
-    result = material.headline("net", "BioTac", right, classes=4)
+    slides = [f"s{index}" for index in range(20)]
+    right = {"model": {slide: at < 18 for at, slide in enumerate(slides)}}
+    result = material.score_table(right, classes=4).headline("material", "net", Question("BioTac"))
     assert result is not None and result.best is not None
     assert (result.best.name, result.measure) == ("chance", "points")
     assert result.gain == pytest.approx(65)
-    right["mean_level"] = {key: (int(at < 19), 1) for at, key in enumerate(slides)}
-    right["permuted_labels"] = dict.fromkeys(slides, (1, 1))  # a control
-    result = material.headline("net", "BioTac", right, classes=4)
+    right["mean_level"] = {slide: at < 19 for at, slide in enumerate(slides)}
+    right["permuted_labels"] = dict.fromkeys(slides, True)  # a control
+    result = material.score_table(right, classes=4).headline("material", "net", Question("BioTac"))
     assert result is not None
     assert [baseline.name for baseline in result.baselines] == ["mean level alone", "chance"]
     assert result.gain == pytest.approx(-5)
@@ -90,17 +101,19 @@ def test_the_gain_in_accuracy_is_in_points_and_chance_is_a_baseline_too() -> Non
 
 def test_the_gain_on_touch_is_the_skill_that_the_metrics_have_over_the_same_baseline() -> None:
     rng = np.random.default_rng(0)
-    true, model, mean = rng.normal(size=(3, 30, 24))
-    squared = [regression.squared_sums(true, predicted) for predicted in (model, mean)]
+    true, model, mean = rng.normal(2000, 300, size=(3, 30, 24))
+    fractions = [biotac_sp.normalise("e_th", values) for values in (true, model, mean)]
+    squared = [regression.squared_sums(fractions[0], predicted) for predicted in fractions[1:]]
     objects = {f"g{index:02d}": f"o{index % 7}" for index in range(30)}
-    errors = [{(0, name): (float(error), 24) for name, error in zip(objects, sums, strict=True)} for sums in squared]
     for known_objects, clusters in ((True, list(objects)), (False, list(objects.values()))):
-        result = touch.headline("net", "e_th", 100.0, errors[0], {"constant": errors[1]}, known_objects, objects)
+        predicted = {"model": model, "constant": mean}
+        scores = touch.score_table("e_th", true, predicted, list(objects), objects, known_objects=known_objects)
+        result = scores.headline("touch", "net", Question())
         expected = regression.skill_interval(squared[0], squared[1], np.array(clusters))
         assert result is not None
         assert (result.gain, result.low, result.high) == pytest.approx(tuple(expected))
         assert (result.clusters, result.cluster) == ((30, "grasps") if known_objects else (7, "objects"))
-        assert result.model.values[1] == pytest.approx(100 * regression.rmse(true, model))
+        assert result.model.values[1] == pytest.approx(regression.rmse(true, model))
 
 
 def test_folds_that_have_seeds_of_their_own_are_no_repeats() -> None:
@@ -110,7 +123,7 @@ def test_folds_that_have_seeds_of_their_own_are_no_repeats() -> None:
     folds: Any = {}
     for fold in range(3):
         folds |= forecasts({name: ratios[name] for name in RECORDINGS[fold::3]}, seed=fold)
-    single, folded = (forward.headline("net", (1,), method, {"persistence": persistence}, None)
+    single, folded = (compared_forecasts(method, {"persistence": persistence})
                       for method in (forecasts(ratios), folds))  # fmt: skip
     assert single is not None and folded is not None
     assert (folded.low, folded.high, folded.seeds) == (single.low, single.high, 1)
@@ -118,8 +131,10 @@ def test_folds_that_have_seeds_of_their_own_are_no_repeats() -> None:
 
 def test_a_few_recordings_that_carry_most_of_the_error_give_no_verdict() -> None:
     sizes = dict(zip(RECORDINGS, [40.0, 30.0, 20.0, *[1.0] * 9], strict=True))
-    errors = [{(0, name): (ratio * size, 1) for name, size in sizes.items()} for ratio in (0.5, 1.0)]
-    result = touch.headline("net", "pdc_th", 100.0, errors[0], {"constant": errors[1]}, True, {})
+    errors: list[Any] = [
+        {(0, name): np.array([ratio * size, 1.0]) for name, size in sizes.items()} for ratio in (0.5, 1.0)
+    ]
+    result = pairing.headline("touch", "net", touch.measure(100.0, "grasps"), errors[0], {"constant": errors[1]})
     assert result is not None and result.low > 0
     assert result.effective == pytest.approx(99**2 / (40**2 + 30**2 + 20**2 + 9))
     assert result.verdict == ""
@@ -128,14 +143,14 @@ def test_a_few_recordings_that_carry_most_of_the_error_give_no_verdict() -> None
     for name, size in sizes.items():
         model |= forecasts({name: 0.5}, persistence=size)
         persistence |= forecasts({name: 1.0}, persistence=size)
-    forecast = forward.headline("net", (1,), model, {"persistence": persistence}, None)
+    forecast = compared_forecasts(model, {"persistence": persistence})
     assert forecast is not None and forecast.verdict == "better"  # there each recording counts the same
 
 
 def test_recordings_on_which_persistence_makes_no_error_are_left_out_and_counted() -> None:
     model, persistence = (forecasts(dict.fromkeys(RECORDINGS, ratio)) for ratio in (0.5, 1.0))
     quiet = forecasts({"quiet": 0.5}, persistence=0.0)
-    result = forward.headline("net", (1,), {**model, **quiet}, {"persistence": {**persistence, **quiet}}, None)
+    result = compared_forecasts({**model, **quiet}, {"persistence": {**persistence, **quiet}})
     assert result is not None
     assert result.gain == pytest.approx(0.5) and (result.clusters, result.left_out) == (12, 1)
     assert "Left out: 1 recording without an error of persistence." in words.legend([result])
@@ -144,7 +159,7 @@ def test_recordings_on_which_persistence_makes_no_error_are_left_out_and_counted
 def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> None:
     sums = {name: forecasts(dict.fromkeys(RECORDINGS, ratio)) for name, ratio in
             (("net", 0.5), ("persistence", 1.0), ("ridge", 0.8), ("mean", 3.0))}  # fmt: skip
-    result = forward.headline("net", (1,), sums.pop("net"), sums, None)
+    result = compared_forecasts(sums.pop("net"), sums)
     assert result is not None and [baseline.name for baseline in result.table_baselines] == ["ridge", "persistence"]
     table = headline_table.text([result])
     row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
@@ -164,7 +179,7 @@ def test_one_large_recording_does_not_decide_and_errors_that_all_rise_are_never_
         reference = np.array([size])
         model[0, name] = forward.sums(((ratio * reference) ** 2, ratio * reference), (reference**2, reference), 1.0)
         persistence[0, name] = forward.sums((reference**2, reference), (reference**2, reference), 1.0)
-    result = forward.headline("net", (1,), model, {"persistence": persistence}, None)
+    result = compared_forecasts(model, {"persistence": persistence})
     assert result is not None
     assert result.model.values[1] > 0 > result.gain == pytest.approx(result.model.values[2])
     assert result.verdict == "worse"
@@ -193,7 +208,7 @@ def test_the_end_that_a_choice_moves_is_that_of_the_largest_of_several_statistic
 def test_seeds_are_left_out_as_recordings_are() -> None:
     model = {key: sums for seed, ratio in enumerate((0.1, 0.9)) for key, sums in
              forecasts(dict.fromkeys(RECORDINGS, ratio), seed=seed).items()}  # fmt: skip
-    result = forward.headline("net", (1,), model, {"persistence": forecasts(dict.fromkeys(RECORDINGS, 1.0))}, None)
+    result = compared_forecasts(model, {"persistence": forecasts(dict.fromkeys(RECORDINGS, 1.0))})
     assert result is not None
     assert result.seeds == 2
     assert result.gain == pytest.approx(1 - math.sqrt(0.1 * 0.9)) and result.low < 0.1 and result.high > 0.9

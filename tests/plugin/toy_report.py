@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.comparison.runs import ComparedRun, PredictorErrors, Question
+from tacpipe.comparison.runs import ComparedRun, Question, ScoreTable
 from tacpipe.report.context import TaskReport
 from tacpipe.scores.pairing import Measure
 
@@ -52,8 +52,6 @@ class WeighingReport(TaskReport):
             }
             about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}
             runs.append(
-                ComparedRun(
-                    result, self.name, **about, questions={Question("light things"): PredictorErrors(WEIGHT, sums)}
-                )
+                ComparedRun(result, self.name, **about, questions={Question("light things"): ScoreTable(WEIGHT, sums)})
             )
         return runs

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.classify.params import Params
 from tacpipe.tasks.learning.task import LearnedTask
+from tacpipe.tasks.task import Demo
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -37,7 +39,7 @@ REQUIREMENTS = Requirements(
 
 
 class ClassifyTask(LearnedTask):
-    """Name a label from touch."""
+    """Name the label of a touch, such as the object or whether a grasp is stable."""
 
     name = "classify"
     requirements = REQUIREMENTS
@@ -60,6 +62,20 @@ class ClassifyTask(LearnedTask):
 
         files, notes = training.train("classify", params, Classes.find(train, params.label), train, workspace)
         return Result(files=files, notes=notes)
+
+    def demo(self, output: Path) -> Demo:
+        """Return the demo: which object a hand grasps, on the grasps of the demo of ``touch``."""
+        from tacpipe.tasks.touch import task as touch
+
+        names = ("grasps", "grasps-split", "object", "object-results")
+        grasps, split, model, results = (str(output / name) for name in names)
+        options = ["--split", split, "--label", "object", "--architecture", "linear"]
+        commands = [
+            *touch.demo(output).commands[:3],
+            ["train", "classify", grasps, "-o", model, *options],
+            ["evaluate", model, grasps, "--split", split, "-o", results],
+        ]
+        return Demo(commands, [results])
 
     @property
     def live(self) -> LiveTask:

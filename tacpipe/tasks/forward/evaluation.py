@@ -18,13 +18,14 @@ from tacpipe.io import Json, terminal
 from tacpipe.io.parquet import to_parquet
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.scores import calibration, headline
+from tacpipe.scores import calibration, headline, table
 from tacpipe.scores.calibration import COVERAGE_FILE, Sums
 from tacpipe.tasks.forward import metrics, rest_shift, situations, tracks
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import (
     BASELINE,
     MODEL,
+    TASK,
     QuantileMeasures,
     look_ahead_notes,
     unit_of_model,
@@ -230,10 +231,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     measured = {**scores.to_json(), **{name: part.to_json() for name, part in parts.items()}}
     measured |= {name: values for name, values in further.items() if values}
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
+    tables = metrics.score_tables(trials, forecaster.horizon, unit_of_model(forecaster.config))
     files = {
-        headline.FILE: headline.write(
-            metrics.headline(method, trials, forecaster.horizon, unit_of_model(forecaster.config))
-        ),
+        headline.FILE: headline.write(table.headlines(TASK, method, tables)),
         "metrics.json": model_files.to_json(measured),
         "horizons.csv": metrics.horizons_csv(scores.predictors, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),

@@ -10,9 +10,9 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.io import Json
-from tacpipe.scores import intervals, pairing
-from tacpipe.scores.headline import Headline
-from tacpipe.scores.pairing import Measure, Sums
+from tacpipe.scores import intervals
+from tacpipe.scores.pairing import Measure
+from tacpipe.scores.table import ScoreTable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -203,27 +203,19 @@ def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
     return np.concatenate([squared, still_squared, absolute, logs, counted, [values]])
 
 
-def headline(
-    method: str,
+def score_table(
     steps: Sequence[int],
-    model: Sums,
-    baselines: Mapping[str, Sums],
-    part: bool | None,
-    runs: int = 1,
+    sums_by_predictor: Mapping[str, Mapping[str, AnyFloats]],
     unit: str = COUNTS,
     objects: Mapping[str, str] | None = None,
-) -> Headline | None:
-    """Compare a method with its baselines on known objects (``part`` True), unseen objects (False), or all (None).
+) -> ScoreTable:
+    """Return the table of scores from the `sums` of each predictor and recording; ``unit`` is that of absolute errors.
 
-    ``model`` and ``baselines`` contain the `sums` by seed and recording, and ``unit`` is the unit of the mean absolute
-    errors. If ``objects`` (object by recording) is passed, the interval is over objects. None if nothing can be
-    compared.
+    If ``objects`` (object by recording) is passed, the interval is over objects.
     """
-    compared = {name: sums_of_baseline for name, sums_of_baseline in baselines.items() if is_baseline(name)}
-    cluster = OBJECTS if objects else RECORDINGS
-    return pairing.headline(
-        TASK, method, measure(steps, unit, cluster), model, compared, part=PARTS[part], clusters=objects, runs=runs
-    )
+    declaration = measure(steps, unit, OBJECTS if objects else RECORDINGS)
+    baselines = {name: name for name in sums_by_predictor if is_baseline(name)}
+    return ScoreTable(declaration, sums_by_predictor, objects, baselines)
 
 
 def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS) -> Measure:

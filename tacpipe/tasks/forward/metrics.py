@@ -15,8 +15,8 @@ import pyarrow as pa
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
 from tacpipe.scores import intervals, regression
-from tacpipe.scores.headline import Headline
 from tacpipe.scores.intervals import Interval
+from tacpipe.scores.table import Question, ScoreTable
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.headline import (
     BASELINE,
@@ -142,10 +142,10 @@ def summary(
     return _scores(fresh, groups, horizon, channel_scale), by_part
 
 
-def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
-    """Compare the model with its baselines on recordings it has not seen, separately for known and unseen objects.
+def score_tables(trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> dict[Question, ScoreTable]:
+    """Return the tables of scores of recordings that the model has not seen, of known and of unseen objects.
 
-    Recordings without labelled objects are evaluated together.
+    Recordings without labelled objects are in one table.
     """
     fresh = [trial for trial in trials if not trial.seen and trial.windows]
     steps = headlines.headline_steps(range(1, horizon + 1))
@@ -155,24 +155,21 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
         sums = trial.errors[predictor]
         return sums.count_squared.sum(axis=1)[step_indices], sums.count_absolute.sum(axis=1)[step_indices]
 
-    def sums_by_recording(predictor: str, part_trials: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
-        sums: dict[tuple[Any, str], AnyFloats] = {}
+    def sums_by_recording(predictor: str, part_trials: Sequence[Trial]) -> dict[str, AnyFloats]:
+        sums = {}
         for trial in part_trials:
             values = trial.windows * trial.errors[predictor].count_squared.shape[1]
-            sums[0, trial.name] = headlines.sums(errors_of(trial, predictor), errors_of(trial, BASELINE), values)
+            sums[trial.name] = headlines.sums(errors_of(trial, predictor), errors_of(trial, BASELINE), values)
         return sums
 
     has_objects = any(trial.object is not None for trial in fresh)
-    headline_list = []
+    tables = {}
     for part in (True, False) if has_objects else (None,):
         part_trials = [trial for trial in fresh if part is None or trial.known == part]
-        names = [name for name in (part_trials[0].errors if part_trials else ()) if name != MODEL]
-        model = sums_by_recording(MODEL, part_trials)
-        baselines = {name: sums_by_recording(name, part_trials) for name in names}
+        sums = {name: sums_by_recording(name, part_trials) for name in (part_trials[0].errors if part_trials else ())}
         objects = {trial.name: str(trial.object) for trial in part_trials} if part is False else None
-        result = headlines.headline(method, steps, model, baselines, part, unit=unit, objects=objects)
-        headline_list += [result] if result else []
-    return headline_list
+        tables[Question(headlines.PARTS[part])] = headlines.score_table(steps, sums, unit, objects)
+    return tables
 
 
 def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: float) -> bytes:

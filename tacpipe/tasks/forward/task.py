@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class ForwardTask(Task):
-    """Forecasts of tactile signals."""
+    """Predict the next tactile signals from the past ones and the planned motion."""
 
     name = "forward"
     requirements = REQUIREMENTS

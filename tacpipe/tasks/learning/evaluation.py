@@ -14,7 +14,7 @@ from tacpipe.datasets.selection import combine_origins
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
-from tacpipe.scores import headline
+from tacpipe.scores import headline, table
 from tacpipe.tasks.learning.answers import Classes
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.model import LearnedModel
@@ -44,7 +44,7 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
         {
             model_files.CONFIG: files[model_files.CONFIG],
             "metrics.json": model_files.to_json(metrics),
-            headline.FILE: headline.write(answered.headlines(model.config["task"], method)),
+            headline.FILE: headline.write(table.headlines(model.config["task"], method, answered.tables())),
         },
         _notes(model, answered),
     )

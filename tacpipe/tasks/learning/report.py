@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import MODEL, ComparedRun, PredictorErrors, Question
+from tacpipe.comparison.runs import MODEL, ComparedRun
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, notes, number, table
@@ -55,17 +55,13 @@ class LearningReport(TaskReport):
         config, metrics = (json.loads(result.files[name]) for name in ("config.json", "metrics.json"))
         answers = answers_of(config["answers"])
         answered = Answered.from_result(result, answers, [MODEL, *config["baselines"]])
-        questions = {}
-        for place, (target, (measure, sums)) in enumerate(answered.questions().items()):
-            rows = {name: {recording: row for (_, recording), row in own.items()} for name, own in sums.items()}
-            questions[Question(target=target, place=place)] = PredictorErrors(measure, rows, answered.groups)
         settings = {name: value for name, value in config["params"].items() if name not in ("architecture", "seed")}
         return ComparedRun(
             result,
             self.name,
             method_name(config["architecture"], config["chosen"]),
             settings,
-            questions,
+            answered.tables(),
             seed=config["params"]["seed"],
             details=LearnedDetails(config, metrics, answered),
         )

@@ -11,17 +11,15 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.scores import calibration, pairing
-from tacpipe.scores.headline import Headline
-from tacpipe.scores.intervals import Estimate
-from tacpipe.scores.pairing import Measure, Sums
+from tacpipe.scores import calibration
+from tacpipe.scores.pairing import Measure
+from tacpipe.scores.table import MODEL, Question, ScoreTable, rounded
 from tacpipe.tasks.learning.answers import Classes, Quantities, Target
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.model import LearnedModel
 from tacpipe.tasks.learning.uncertainty import ClassProbabilities, ErrorQuantiles
 
 PREDICTIONS = "predictions"  # the recording of a result
-MODEL = "model"
 RECORDING, CLUSTER, TRUE = "recording", "group", "true"
 SEPARATOR = " by "  # between target and predictor in names of columns
 BAND = (10, 90)  # percents of the band whose coverage is measured
@@ -111,28 +109,23 @@ class Answered:
         """The group of each recording."""
         return dict(zip(self.recordings, self.clusters, strict=True))
 
-    def questions(self) -> dict[str, tuple[Measure, dict[str, Sums]]]:
-        """Return the measure of each target, or of the classes, and the sums of each predictor by recording."""
+    def tables(self) -> dict[Question, ScoreTable]:
+        """Return the table of scores of each target, or of the classes."""
         if isinstance(self.answers, Classes):
-            return {"": (class_measure(self._unit), self._by_recording(self._class_parts))}
+            return {Question(): self._table(class_measure(self._unit), self._class_parts)}
         return {
-            target.name: (quantity_measure(target, self._unit), self._by_recording(self._quantity_parts(index)))
-            for index, target in enumerate(self.answers.targets)
+            Question(target=target.name, place=place): self._table(
+                quantity_measure(target, self._unit), self._quantity_parts(place)
+            )
+            for place, target in enumerate(self.answers.targets)
         }
+
+    def _table(self, measure: Measure, parts: Mapping[str, Floats]) -> ScoreTable:
+        return ScoreTable.from_rows(measure, self.recordings, parts, self.groups)
 
     @property
     def _unit(self) -> str:
         return "recordings" if set(self.clusters) == set(self.recordings) else "groups"
-
-    def _by_recording(self, parts: Mapping[str, Floats]) -> dict[str, Sums]:
-        """Return the sums over the rows of each recording of parts (row, part), by predictor."""
-        names, owners = np.unique(np.array(self.recordings), return_inverse=True)
-        sums_by_predictor: dict[str, Sums] = {}
-        for predictor, rows in parts.items():
-            sums = np.zeros((len(names), rows.shape[1]))
-            np.add.at(sums, owners, rows)
-            sums_by_predictor[predictor] = {(0, str(name)): row for name, row in zip(names, sums, strict=True)}
-        return sums_by_predictor
 
     def _quantity_parts(self, target: int) -> dict[str, Floats]:
         assert isinstance(self.answers, Quantities)
@@ -153,35 +146,17 @@ class Answered:
             parts[name] = np.stack([np.ones(len(labels)), right.astype(np.float64), losses], axis=1)
         return parts
 
-    def headlines(self, task: str, method: str) -> list[Headline]:
-        """Return the comparison of the model with its baselines for each question."""
-        headlines = []
-        for target, (measure, sums) in self.questions().items():
-            baselines = {name.replace("_", " "): own for name, own in sums.items() if name != MODEL}
-            compared = pairing.headline(
-                task, method, measure, sums[MODEL], baselines, target=target, clusters=self.groups
-            )
-            if compared is not None:
-                headlines.append(compared)
-        return headlines
-
     def metrics(self) -> dict[str, Any]:
         """Return the values of each predictor by target, with their intervals and the coverage of the band."""
         by_target: dict[str, Any] = {}
-        for index, (target, (measure, sums)) in enumerate(self.questions().items()):
-            own: dict[str, Any] = {}
-            for name, by_recording in sums.items():
-                values = measure.values(np.sum(list(by_recording.values()), axis=0))
-                own[name] = {
-                    **{column: _rounded(value) for column, value in zip(measure.columns, values, strict=True)},
-                    "interval": _ends(pairing.score(measure, by_recording, self.groups)),
-                }
+        for index, (question, table) in enumerate(self.tables().items()):
+            own = table.to_json()
             if self.bands is not None:
                 inside = (self.true[:, index] >= self.bands[:, index, 0]) & (
                     self.true[:, index] <= self.bands[:, index, 1]
                 )
-                own["band"] = {"percent": BAND[1] - BAND[0], "covered": _rounded(100 * inside.mean())}
-            by_target[target or "classes"] = own
+                own["band"] = {"percent": BAND[1] - BAND[0], "covered": rounded(100 * inside.mean())}
+            by_target[question.target or "classes"] = own
         counts = {
             "rows": len(self.recordings),
             "recordings": len(set(self.recordings)),
@@ -245,11 +220,3 @@ def class_measure(cluster: str) -> Measure:
         weight=lambda sums: sums[:, 0],
         reference="constant",
     )
-
-
-def _rounded(value: float) -> float | None:
-    return float(f"{value:.6g}") if np.isfinite(value) else None
-
-
-def _ends(estimate: Estimate) -> list[float | None]:
-    return [_rounded(estimate.low), _rounded(estimate.high)]

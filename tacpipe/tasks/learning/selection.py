@@ -15,6 +15,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Indices
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
+from tacpipe.printable import round_to
 from tacpipe.tasks.learning.answers import ModelAnswers
 from tacpipe.tasks.learning.estimators import OutputEstimator
 from tacpipe.tasks.learning.examples import Examples
@@ -117,9 +118,9 @@ def select(
             {
                 "name": name,
                 "baseline": name in baselines,
-                "loss": _rounded(by_fold.mean()),
-                "excess": _rounded(excess.mean()),
-                "error": _rounded(error),
+                "loss": round_to(by_fold.mean(), 6),
+                "excess": round_to(excess.mean(), 6),
+                "error": round_to(error, 6),
             }
         )
     return Selection(_chosen(table, list(candidates)), table, predicted)
@@ -173,9 +174,5 @@ def learning_curve(fit: Fit, answers: ModelAnswers, examples: Examples, seed: in
             predicted[folds == fold] = estimator.outputs(examples.select(folds == fold))
             used.append(len(kept))
         loss = mean_losses(answers)(predicted, examples, folds).mean()
-        points.append({"groups": float(np.mean(used)), "loss": _rounded(loss)})
+        points.append({"groups": float(np.mean(used)), "loss": round_to(loss, 6)})
     return points
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")

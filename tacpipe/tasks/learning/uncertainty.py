@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Ints
+from tacpipe.printable import round_to
 from tacpipe.scores import calibration
 from tacpipe.tasks.learning.answers import Classes, ModelAnswers, Quantities
 
@@ -47,8 +48,8 @@ class ErrorQuantiles:
             for number in range(len(inner) + 1):
                 own = error[bins == number] if (bins == number).any() else error
                 levels = np.clip(np.array(percents) / 100 * (len(own) + 1) - 0.5, 0, len(own)) / max(len(own), 1)
-                rows.append(tuple(map(_rounded, np.quantile(own, levels, method="hazen").tolist())))
-            edges.append(tuple(map(_rounded, inner.tolist())))
+                rows.append(tuple(_stored(np.quantile(own, levels, method="hazen"))))
+            edges.append(tuple(_stored(inner)))
             quantiles.append(tuple(rows))
         return cls(tuple(edges), tuple(quantiles), percents)
 
@@ -89,9 +90,9 @@ class ClassProbabilities:
     @classmethod
     def fit(cls, scores: AnyFloats, labels: Ints, false_unknown: float = FALSE_UNKNOWN) -> ClassProbabilities:
         """Return the temperature and threshold for scores (example, class) of examples that were not learned from."""
-        temperature = float(f"{calibration.temperature(scores, labels):.9g}")
+        temperature = round_to(calibration.temperature(scores, labels), 9)
         best = calibration.probabilities(scores, temperature).max(axis=1)
-        return cls(temperature, _rounded(np.quantile(best, false_unknown)))
+        return cls(temperature, round_to(np.quantile(best, false_unknown), 9))
 
     def probabilities(self, scores: AnyFloats) -> Floats:
         """Return the probability of each class (example, class)."""
@@ -132,5 +133,5 @@ def measure_uncertainty(
     return ClassProbabilities.fit(outputs[labels >= 0], labels[labels >= 0], false_unknown)
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.9g}")
+def _stored(values: AnyFloats) -> list[float]:
+    return [round_to(value, 9) for value in values.tolist()]

@@ -18,8 +18,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.plugins.stage import Attribute, RecordingOutput, Result
 from tacpipe.printable import listed
-from tacpipe.scores import headline
+from tacpipe.scores import headline, table
 from tacpipe.scores.intervals import mcnemar, wilson
+from tacpipe.scores.table import Question, ScoreTable
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, Classifier, ReaderOutput
@@ -150,7 +151,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     for sensor, result in evaluated.items():
         rows += [(sensor, result, int(index)) for index in np.flatnonzero(result.counted & ~result.in_training)]
     files = {
-        headline.FILE: headline.write(_headlines(evaluated, classifier)),
+        headline.FILE: headline.write(
+            table.headlines(headlines.TASK, classifier.config["architecture"], _tables(evaluated, classifier))
+        ),
         "metrics.json": model_files.to_json(tree),
         "confusion.csv": confusion_csv(
             [sensor for sensor, _, _ in rows],
@@ -160,10 +163,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    table = predictions_table(
+    predicted = predictions_table(
         evaluated, classifier, {name: labels.get("session") for name, labels in attributes.items()}
     )
-    return Result({PREDICTIONS: RecordingOutput(table, selection.combine_origins(attributes.values()))}, files)
+    return Result({PREDICTIONS: RecordingOutput(predicted, selection.combine_origins(attributes.values()))}, files)
 
 
 def _read_slides(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
@@ -267,19 +270,15 @@ def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen
     return summary(right, len(classifier.classes))
 
 
-def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> list[headline.Headline]:
-    """Return comparisons of the model with its baselines on each sensor's unseen slides."""
-    sensor_headlines = []
+def _tables(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> dict[Question, ScoreTable]:
+    """Return the table of scores of each sensor's unseen slides."""
+    tables = {}
     for sensor, result in evaluated.items():
         mask = ~result.in_training & result.counted & ~result.held_out
-        keys = [(0, str(name)) for name in np.array(result.slides.names)[mask]]
-        counts = {}  # correct slides and slides (0 or 1, 1) by predictor and slide
-        for predictor in result.predicted:
-            is_right = result.is_right(predictor, mask)
-            counts[predictor] = {key: (int(right), 1) for key, right in zip(keys, is_right, strict=True)}
-        sensor_headline = headlines.headline(classifier.config["architecture"], sensor, counts, len(classifier.classes))
-        sensor_headlines += [sensor_headline] if sensor_headline else []
-    return sensor_headlines
+        slides = np.array(result.slides.names)[mask].tolist()
+        right = {name: dict(zip(slides, result.is_right(name, mask), strict=True)) for name in result.predicted}
+        tables[Question(headlines.sensor_title(sensor))] = headlines.score_table(right, len(classifier.classes))
+    return tables
 
 
 def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> ZeroShotAccuracy | None:

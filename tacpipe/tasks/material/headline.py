@@ -15,10 +15,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import Json
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
-from tacpipe.scores import pairing
 from tacpipe.scores.calibration import ConfidenceBin
-from tacpipe.scores.headline import Headline
-from tacpipe.scores.pairing import Measure, Sums
+from tacpipe.scores.pairing import Measure
+from tacpipe.scores.table import MODEL, ScoreTable
 from tacpipe.tasks.material.params import KEY, StoredNaming
 
 TASK = "material"
@@ -39,31 +38,20 @@ def sensor_title(sensor: str) -> str:
     return SENSORS.get(sensor, sensor)
 
 
-def headline(
-    method: str,
-    sensor: str,
-    right: Mapping[str, Mapping[tuple[Any, str], tuple[int, int]]],
-    classes: int,
-    *,
-    model: str = "model",
-    runs: int = 1,
-) -> Headline | None:
-    """Return the comparison of a method with its baselines on a sensor's slides, or None without slides.
+def score_table(right: Mapping[str, Mapping[str, bool]], classes: int) -> ScoreTable:
+    """Return the table of scores of a sensor's slides.
 
-    ``right`` contains, by predictor and then by seed and slide, the numbers of correct and of all classifications.
-    Guessing among ``classes`` is an additional baseline, unless ``classes`` is 0.
+    ``right`` states by predictor and slide whether the material is right. Guessing among ``classes`` is another predictor,
+    unless ``classes`` is 0.
     """
-    model_sums = _sums(right.get(model, {}))
-    baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
+    sums = {
+        name: {slide: np.array([float(is_right), 1.0]) for slide, is_right in slides.items()}
+        for name, slides in right.items()
+        if slides
+    }
     if classes:
-        baselines[CHANCE] = {
-            key: np.array([slide_sums[1] / classes, slide_sums[1]]) for key, slide_sums in model_sums.items()
-        }
-    return pairing.headline(TASK, method, MEASURE, model_sums, baselines, part=sensor_title(sensor), runs=runs)
-
-
-def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:
-    return {key: np.array(counts, dtype=np.float64) for key, counts in right.items()}
+        sums[CHANCE] = {slide: np.array([1 / classes, 1.0]) for slide in right.get(MODEL, {})}
+    return ScoreTable(MEASURE, sums, baselines={**BASELINES, CHANCE: CHANCE})
 
 
 def _wrong(sums: AnyFloats) -> AnyFloats:

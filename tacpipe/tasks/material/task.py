@@ -84,7 +84,7 @@ REQUIREMENTS = Requirements(
 
 
 class MaterialTask(Task):
-    """Classify materials."""
+    """Name the material under a sliding finger."""
 
     name = "material"
     requirements = REQUIREMENTS

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.learning.task import LearnedTask
 from tacpipe.tasks.regress.params import Params
+from tacpipe.tasks.task import Demo
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -45,7 +47,7 @@ REQUIREMENTS = Requirements(
 
 
 class RegressTask(LearnedTask):
-    """Estimate quantities from touch."""
+    """Estimate forces, places and other quantities from touch."""
 
     name = "regress"
     requirements = REQUIREMENTS
@@ -69,6 +71,21 @@ class RegressTask(LearnedTask):
         answers = Quantities.find(train, patterns, params.horizon_s)
         files, notes = training.train("regress", params, answers, train, workspace)
         return Result(files=files, notes=notes)
+
+    def demo(self, output: Path) -> Demo:
+        """Return the demo: the force of a finger, on the trials of the demo of ``forward``."""
+        from tacpipe.tasks.forward import task as forward
+
+        segments, split, model, results = (
+            str(output / name) for name in ("segments", "split", "force", "force-results")
+        )
+        options = ["--split", split, "--target", "gt_finger1_normal_n", "--architecture", "linear", "--stride", "5"]
+        commands = [
+            *forward.demo(output).commands[:4],
+            ["train", "regress", segments, "-o", model, *options],
+            ["evaluate", model, segments, "--split", split, "-o", results],
+        ]
+        return Demo(commands, [results])
 
     @property
     def live(self) -> LiveTask:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import Floats
+from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.selection import combine_origins
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.scores import headline, pairing
-from tacpipe.scores.pairing import Sums
+from tacpipe.scores import headline
+from tacpipe.scores.table import MODEL, Question, ScoreTable, headlines, rounded
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.slip import metrics
 from tacpipe.tasks.slip.calibration import ScoredTrack
@@ -26,7 +25,6 @@ from tacpipe.tasks.slip.model import SlipModel
 from tacpipe.tasks.slip.training import TASK, labelled_tracks, scored_tracks, scores_of
 from tacpipe.tasks.slip.windows import STABLE, read_examples
 
-MODEL = "model"
 WINDOWS, EVENTS = "windows", "events.json"
 
 
@@ -126,45 +124,37 @@ class EvaluatedSlips:
         """The object of each recording."""
         return {track.name: track.object for track in self.tracks}
 
-    @functools.cached_property
-    def layout(self) -> AreaLayout:
-        """The places of sums for the objects of these recordings alone."""
-        return AreaLayout(self.objects.values())
+    def tables(self, objects: Iterable[str] = ()) -> dict[str, ScoreTable]:
+        """Return the table of scores of each part of `PARTS`.
 
-    @functools.cached_property
-    def own_sums(self) -> dict[str, dict[str, Sums]]:
-        """The `sums` in the `layout` of these recordings."""
-        return self.sums(self.layout)
-
-    def sums(self, layout: AreaLayout, parts: Collection[str] = PARTS) -> dict[str, dict[str, Sums]]:
-        """Return the sums of each recording (`AreaLayout`) by predictor and part of `PARTS`."""
+        ``objects`` are those of all results that are compared, by default of these recordings.
+        """
+        layout = AreaLayout(objects or self.objects.values())
         folds = self.folds or (0,) * len(self.tracks)
-        by_predictor: dict[str, dict[str, Sums]] = {name: {part: {} for part in parts} for name in self.scores}
-        for name, sums in by_predictor.items():
+        sums: dict[str, dict[str, dict[str, AnyFloats]]] = {part: {} for part in PARTS}
+        for name in self.scores:
             tracks = list(zip(folds, self.scored_by(name), self.probabilities[name], strict=True))
             for number in sorted(set(folds)):
                 windows = WindowScores([track for fold, track, _ in tracks if fold == number])
                 probabilities = metrics.joined(values for fold, _, values in tracks if fold == number)
-                for part in parts:
-                    sums[part] = {**sums[part], **windows.sums(part, layout, probabilities)}
-        return by_predictor
+                for part in PARTS:
+                    sums[part].setdefault(name, {}).update(windows.sums(part, layout, probabilities))
+        return {part: ScoreTable(layout.measure(), by_predictor, self.objects) for part, by_predictor in sums.items()}
 
     def measure(self, horizon_ns: int) -> dict[str, Any]:
         """Return the metrics of each predictor, and the margin of the model over each baseline."""
-        measure, sums, windows = self.layout.measure(), self.own_sums, WindowScores(self.tracks)
+        tables, windows = self.tables(), WindowScores(self.tracks)
         by_predictor: dict[str, Any] = {}
-        for name, parts in sums.items():
+        for name in self.scores:
             probabilities = metrics.joined(self.probabilities[name])
-            brier = metrics.brier(probabilities, windows.states > STABLE, windows.weights)
             by_predictor[name] = {
-                "auc": metrics.areas(parts, measure, self.objects),
-                "brier": float(f"{brier:.6g}") if brier == brier else None,
+                "auc": {part: metrics.to_json(table.score(name)) for part, table in tables.items()},
+                "brier": rounded(metrics.brier(probabilities, windows.states > STABLE, windows.weights)),
                 "accuracy": metrics.accuracy(probabilities, windows),
                 "alarms": self.alarms(name, horizon_ns),
             }
             if name != MODEL:
-                margin = pairing.difference(measure, sums[MODEL]["before"], parts["before"], self.objects)
-                by_predictor[name]["margin"] = metrics.to_json(margin)
+                by_predictor[name]["margin"] = metrics.to_json(tables["before"].gain_over(name))
         counts = {
             "recordings": len(self.tracks),
             "objects": windows.object_count,
@@ -244,18 +234,17 @@ class EvaluatedSlips:
         return cls(tuple(tracks), column_by_track("score"), column_by_track("probability"), levels, known)
 
 
+def questions(tables: Mapping[str, ScoreTable]) -> dict[Question, ScoreTable]:
+    """Return the tables of scores of `QUESTIONS`, which have a verdict."""
+    return {
+        Question(target=target, place=place): tables[part] for place, (part, target) in enumerate(QUESTIONS.items())
+    }
+
+
 def headlines_of(method: str, evaluated: EvaluatedSlips) -> list[headline.Headline]:
     """Return the areas under the curve of the model next to those of its baselines for each of `QUESTIONS`.
 
     The intervals are over objects. A question without pairs of windows is omitted.
     """
-    measure, sums = evaluated.layout.measure(), evaluated.own_sums
-    headlines = []
-    for part, target in QUESTIONS.items():
-        baselines = {name.replace("_", " "): sums[name][part] for name in sums if name != MODEL}
-        compared = pairing.headline(
-            TASK, method, measure, sums[MODEL][part], baselines, target=target, clusters=evaluated.objects
-        )
-        if compared and np.isfinite(compared.model.values[0]):
-            headlines.append(compared)
-    return headlines
+    compared = headlines(TASK, method, questions(evaluated.tables()))
+    return [each for each in compared if np.isfinite(each.model.values[0])]

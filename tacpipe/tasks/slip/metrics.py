@@ -13,9 +13,9 @@ from typing import Literal, TypedDict
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s
-from tacpipe.scores import pairing
 from tacpipe.scores.intervals import Estimate, share_interval
-from tacpipe.scores.pairing import Gain, Measure, Sums
+from tacpipe.scores.pairing import Gain, Measure
+from tacpipe.scores.table import rounded
 from tacpipe.tasks.slip.calibration import EventScore, ScoredTrack, false_alarms, score_events, stable_minutes
 from tacpipe.tasks.slip.windows import BEFORE, DURING, STABLE
 
@@ -143,7 +143,7 @@ class WindowScores:
         before = (self.states == BEFORE) & (np.abs(self.until_s - lead_s) <= LEAD_WIDTH_S)
         return before | stable, before
 
-    def sums(self, name: str, layout: AreaLayout, probabilities: Floats) -> Sums:
+    def sums(self, name: str, layout: AreaLayout, probabilities: Floats) -> dict[str, AnyFloats]:
         """Return the sums of each recording (`AreaLayout`) for a part of `PARTS`, and ``probabilities`` (window,) of slips.
 
         Windows of the part within are compared in each recording only, with equal weight for each window before a slip.
@@ -170,7 +170,7 @@ class WindowScores:
                 wins = _wins(self.scores[positive], self.scores[stable], weights[stable])
                 np.add.at(rows[:, layout.wins.start + number], self.recording[positive], wins * weights[positive])
                 rows[:, layout.pairs.start + number] = slip_weights * weights[stable].sum()
-        return {(0, track.name): row for track, row in zip(self.tracks, rows, strict=True)}
+        return {track.name: row for track, row in zip(self.tracks, rows, strict=True)}
 
     def _add_pairs_within(self, rows: AnyFloats, layout: AreaLayout, counted: Bools, positive: Bools) -> None:
         """Add the pairs of windows of the same recording to ``rows`` (recording, part)."""
@@ -208,16 +208,7 @@ def ratio_estimate(flags: Bools, owners: Indices, count: int) -> ObjectEstimate:
 
 def to_json(estimate: Estimate | Gain) -> ObjectEstimate:
     """Return a value and its interval with 6 digits; NaN becomes null."""
-    value, low, high = (
-        float(f"{number:.6g}") if np.isfinite(number) else None
-        for number in (estimate.mean, estimate.low, estimate.high)
-    )
-    return {"value": value, "low": low, "high": high}
-
-
-def areas(sums: Mapping[str, Sums], measure: Measure, objects: Mapping[str, str]) -> dict[str, ObjectEstimate]:
-    """Return the area under the curve of each part, with intervals over objects; ``objects`` are those of recordings."""
-    return {name: to_json(pairing.score(measure, part, objects)) for name, part in sums.items()}
+    return {"value": rounded(estimate.mean), "low": rounded(estimate.low), "high": rounded(estimate.high)}
 
 
 def brier(probabilities: AnyFloats, slips: Bools, weights: AnyFloats) -> float:

@@ -6,12 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tacpipe.comparison.runs import ComparedRun, Method, PredictorErrors, Question
+from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report.blocks import NONE, Cell, Fold, fixed, fold, notes, table
 from tacpipe.report.context import Context, TaskReport
-from tacpipe.tasks.slip.evaluation import EVENTS, MODEL, WINDOWS, EvaluatedSlips
-from tacpipe.tasks.slip.metrics import PARTS, QUESTIONS, AreaLayout, ObjectEstimate
+from tacpipe.scores.table import MODEL
+from tacpipe.tasks.slip.evaluation import EVENTS, WINDOWS, EvaluatedSlips, questions
+from tacpipe.tasks.slip.metrics import PARTS, ObjectEstimate
 
 ALARM_HEADS = {
     "minutes": "minutes of stable contact",
@@ -42,16 +43,10 @@ class SlipReport(TaskReport):
             for result in results
             if WINDOWS in result.recordings and EVENTS in result.files
         ]
-        layout = AreaLayout(name for _, evaluated in stored for name in evaluated.objects.values())
-        measure = layout.measure()
+        objects = {name for _, evaluated in stored for name in evaluated.objects.values()}
         runs = []
         for result, evaluated in stored:
             config = json.loads(result.files["config.json"])
-            sums = evaluated.sums(layout, QUESTIONS)
-            questions = {}
-            for place, (part, target) in enumerate(QUESTIONS.items()):
-                rows = {name: {key[1]: row for key, row in parts[part].items()} for name, parts in sums.items()}
-                questions[Question(target=target, place=place)] = PredictorErrors(measure, rows, evaluated.objects)
             settings = {name: value for name, value in config["params"].items() if name not in ("architecture", "seed")}
             runs.append(
                 ComparedRun(
@@ -59,7 +54,7 @@ class SlipReport(TaskReport):
                     self.name,
                     config["architecture"],
                     settings,
-                    questions,
+                    questions(evaluated.tables(objects)),
                     seed=config["params"]["seed"],
                     fold=min(evaluated.levels, default=""),
                     control=config["params"].get("labels") == "shuffled",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.slip.params import Params
-from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
+from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
@@ -58,7 +59,7 @@ REQUIREMENTS = Requirements(
 
 
 class SlipTask(Task):
-    """Predict slips of a held object."""
+    """Predict whether a held object slips within the next second."""
 
     name = "slip"
     requirements = REQUIREMENTS
@@ -103,6 +104,19 @@ class SlipTask(Task):
         from tacpipe.tasks.slip.model import calibrate
 
         return Calibration("probabilities", calibrate)
+
+    def demo(self, output: Path) -> Demo:
+        """Return the demo on simulated trials in which some objects slip."""
+        names = ("handled", "handled-split", "slips", "slips-results")
+        trials, split, model, results = (str(output / name) for name in names)
+        options = ["--split", split, "--streams", "xela*", "--stride", "4", "--architecture", "linear"]
+        commands = [
+            ["simulate", "forward", "--trials", "24", "--duration-s", "7", "--handling", "mixed", "-o", trials],
+            ["split", trials, "-o", split, "--scheme", "random", "--val", "0.2", "--test", "0.4"],
+            ["train", "slip", trials, "-o", model, *options],
+            ["evaluate", model, trials, "--split", split, "-o", results],
+        ]
+        return Demo(commands, [results])
 
     @property
     def live(self) -> LiveTask:

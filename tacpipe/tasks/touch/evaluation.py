@@ -19,8 +19,9 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.scores import headline, regression
+from tacpipe.scores import headline, regression, table
 from tacpipe.scores.calibration import COVERAGE_FILE
+from tacpipe.scores.table import Question, ScoreTable
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import quantiles
@@ -187,7 +188,13 @@ def _evaluation_result(
         **({"quantiles": quantile_measures} if quantile_measures else {}),
     }
     files = {
-        headline.FILE: headline.write(_headlines(predictor, grasps, predicted, in_training, is_known)),
+        headline.FILE: headline.write(
+            table.headlines(
+                headlines.TASK,
+                predictor.config["architecture"],
+                _tables(predictor, grasps, predicted, in_training, is_known),
+            )
+        ),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _object_csv(fresh),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
@@ -227,27 +234,21 @@ def _quantiles(
     return {**predictor.config["quantiles"], **measures}
 
 
-def _headlines(
+def _tables(
     predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
-) -> list[headline.Headline]:
-    """Return comparisons of the model with its baselines by target, on known and on novel objects."""
+) -> dict[Question, ScoreTable]:
+    """Return the table of scores of each target, on known and on novel objects."""
     objects = {name: object_name or "unnamed" for name, object_name in zip(grasps.names, grasps.objects, strict=True)}
-    target_headlines = []
-    for part in (True, False):
-        rows = np.flatnonzero((is_known == part) & ~in_training)
+    tables = {}
+    for known_objects in (True, False):
+        rows = np.flatnonzero((is_known == known_objects) & ~in_training)
+        names = [grasps.names[row] for row in rows]
         for target in predictor.targets:
-            true = biotac_sp.normalise(target, grasps.readings[target])
-            errors = {}
-            for name, readings in predicted.items():
-                squared = regression.squared_sums(true, biotac_sp.normalise(target, readings[target]))
-                errors[name] = {(0, grasps.names[row]): (float(squared[row]), true.shape[1]) for row in rows}
-            model = errors.pop(MODEL)
-            low, high = biotac_sp.RANGES[target]
-            target_headline = headlines.headline(
-                predictor.config["architecture"], target, high - low, model, errors, part, objects
+            readings = {name: values[target][rows] for name, values in predicted.items()}
+            tables[Question(headlines.PARTS[known_objects], headlines.TARGETS[target])] = headlines.score_table(
+                target, grasps.readings[target][rows], readings, names, objects, known_objects=known_objects
             )
-            target_headlines += [target_headline] if target_headline else []
-    return target_headlines
+    return tables
 
 
 def _scores(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> TouchScores:

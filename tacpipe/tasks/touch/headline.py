@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
-from tacpipe.scores import pairing
-from tacpipe.scores.headline import Headline
-from tacpipe.scores.pairing import Measure, Sums
+from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.channels import biotac_sp
+from tacpipe.scores import regression
+from tacpipe.scores.pairing import Measure
+from tacpipe.scores.table import MODEL as MODEL
+from tacpipe.scores.table import ScoreTable
 
 TASK = "touch"
 PARTS = {True: "known objects", False: "novel objects", None: "all objects"}
@@ -27,40 +28,29 @@ BASELINES = {  # predictors in every result -> names in tables
 }
 
 
-def headline(
-    method: str,
+def score_table(
     target: str,
-    range_counts: float,
-    model: Mapping[tuple[Any, str], tuple[float, int]],
-    baselines: Mapping[str, Mapping[tuple[Any, str], tuple[float, int]]],
-    known_objects: bool | None,
+    true: Floats,
+    predicted: Mapping[str, Floats],
+    grasps: Sequence[str],
     objects: Mapping[str, str],
-    runs: int = 1,
-) -> Headline | None:
-    """Return the comparison of a method with its baselines on one target, or None without grasps.
+    *,
+    known_objects: bool,
+) -> ScoreTable:
+    """Return the table of scores of a target from readings in counts, ``true`` and by predictor (grasp, value).
 
-    Errors are stored by seed and grasp as (sum of squares, number of values), the squares in fractions of the target's
-    range ``range_counts``. The interval is over grasps if objects are known, otherwise over ``objects`` (grasp ->
-    object). ``known_objects`` is None for grasps of both.
+    Errors are fractions of the target's range. Intervals are over ``grasps`` if objects are known, else over ``objects``
+    (grasp -> object).
     """
-    clusters = None if known_objects else objects
-    compared = {BASELINES.get(name, name.replace("_", " ")): _sums(sums) for name, sums in baselines.items() if sums}
-    target_measure = measure(range_counts, "grasps" if known_objects else "objects")
-    return pairing.headline(
-        TASK,
-        method,
-        target_measure,
-        _sums(model),
-        compared,
-        part=PARTS[known_objects],
-        target=TARGETS[target],
-        clusters=clusters,
-        runs=runs,
-    )
-
-
-def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
-    return {key: np.array([squared, float(count)]) for key, (squared, count) in errors.items()}
+    low, high = biotac_sp.RANGES[target]
+    fractions = biotac_sp.normalise(target, true)
+    sums = {}
+    for name, readings in predicted.items():
+        squared = regression.squared_sums(fractions, biotac_sp.normalise(target, readings))
+        rows = np.stack([squared, np.full(len(squared), float(true.shape[1]))], axis=1)
+        sums[name] = dict(zip(grasps, rows, strict=True))
+    units = measure(high - low, "grasps" if known_objects else "objects")
+    return ScoreTable(units, sums, None if known_objects else objects, BASELINES)
 
 
 def measure(range_counts: float, cluster: str) -> Measure:
@@ -96,5 +86,5 @@ def measure(range_counts: float, cluster: str) -> Measure:
 
 
 PREDICTIONS = "predictions"  # recording with one stream per name below; all streams have the same grasps as rows
-GRASPS, TRUE, MODEL = "grasps", "true", "model"
+GRASPS, TRUE = "grasps", "true"
 CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # baselines

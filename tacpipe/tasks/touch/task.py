@@ -88,7 +88,7 @@ REQUIREMENTS = Requirements(
 
 
 class TouchTask(Task):
-    """Predict the readings of grasps."""
+    """Predict what the fingers will measure in a planned grasp."""
 
     name = "touch"
     requirements = REQUIREMENTS

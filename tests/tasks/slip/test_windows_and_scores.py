@@ -13,10 +13,10 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 from sklearn.preprocessing import StandardScaler
 
+from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.boosting import BoostedTrees, TreeSizes
-from tacpipe.scores import pairing
-from tacpipe.scores.pairing import Sums
+from tacpipe.scores.table import MODEL, ScoreTable
 from tacpipe.tasks.learning import estimators
 from tacpipe.tasks.learning.estimators import FittedLinear
 from tacpipe.tasks.learning.examples import Examples
@@ -155,7 +155,7 @@ def test_the_area_under_the_curve_is_that_of_scikit_learn_for_any_draw_of_object
     assert layout.area(chosen @ np.stack(list(rows.values()))) == pytest.approx(expected)
 
 
-def sums_of(windows: metrics.WindowScores, part: str = "before") -> tuple[metrics.AreaLayout, Sums]:
+def sums_of(windows: metrics.WindowScores, part: str = "before") -> tuple[metrics.AreaLayout, dict[str, AnyFloats]]:
     """Return the sums of recordings for the area of a part, and their layout."""
     layout = metrics.AreaLayout(track.object for track in windows.tracks)
     return layout, windows.sums(part, layout, np.zeros(len(windows.scores)))
@@ -164,22 +164,19 @@ def sums_of(windows: metrics.WindowScores, part: str = "before") -> tuple[metric
 def estimate_of(windows: metrics.WindowScores) -> metrics.ObjectEstimate:
     """Return the area under the curve of windows before slips."""
     layout, rows = sums_of(windows)
-    return metrics.areas({"before": rows}, layout.measure(), {track.name: track.object for track in windows.tracks})[
-        "before"
-    ]
+    table = ScoreTable(layout.measure(), {MODEL: rows}, {track.name: track.object for track in windows.tracks})
+    return metrics.to_json(table.score(MODEL))
 
 
 def test_scores_of_different_folds_are_not_compared() -> None:
     states = np.repeat([BEFORE, STABLE], 5)
     perfect = {fold: scored(np.where(states == BEFORE, 1.0, 0.0) + 10 * fold, states) for fold in (0, 1)}
     tracks = tuple(dataclasses.replace(track, name=f"r{fold}", object=f"o{fold}") for fold, track in perfect.items())
-    scores = {evaluation.MODEL: tuple(track.scores for track in tracks)}
-    layout = metrics.AreaLayout(["o0", "o1"])
+    scores = {MODEL: tuple(track.scores for track in tracks)}
     areas = []
     for folds in ((0, 0), (0, 1)):
         evaluated = evaluation.EvaluatedSlips(tracks, scores, {**scores}, {}, folds=folds)
-        rows = evaluated.sums(layout, ("before",))[evaluation.MODEL]["before"]
-        areas.append(float(layout.area(np.sum(list(rows.values()), axis=0)[None])[0]))
+        areas.append(evaluated.tables()["before"].score(MODEL).mean)
     assert areas == [0.75, 1.0]  # the second fold's scores are higher throughout
 
 
@@ -211,7 +208,7 @@ def test_the_interval_of_an_area_is_students_over_areas_without_one_object_each(
     difference = areas - others
     width = scipy.stats.t.ppf(0.975, 8) * np.sqrt(8 / 9 * np.square(difference - difference.mean()).sum())
     (layout, rows), (_, other_rows) = sums_of(windows), sums_of(other)
-    margin = pairing.difference(layout.measure(), rows, other_rows)
+    margin = ScoreTable(layout.measure(), {MODEL: rows, "other": other_rows}).gain_over("other")
     assert margin.high - margin.mean == pytest.approx(width, rel=1e-4)
 
 

@@ -28,7 +28,8 @@ from tacpipe.live.stages import (
     streams_as_recorded,
 )
 from tacpipe.plugins.stage import Result
-from tacpipe.scores import headline
+from tacpipe.scores import headline, table
+from tacpipe.scores.table import Question
 from tacpipe.tasks.forward import evaluation
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -192,15 +193,14 @@ def _headline(
 
     def sums(name: str) -> Any:
         return {
-            (0, recording): headlines.sums(session.sums[name], session.sums[LIVE_STILL], session.rows * channels)
+            recording: headlines.sums(session.sums[name], session.sums[LIVE_STILL], session.rows * channels)
             for recording, session in compared.items()
         }
 
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']} · published live"
-    baselines = {"persistence": sums(LIVE_STILL)}
-    unit = headlines.unit_of_model(forecaster.config)
-    line = headlines.headline(method, steps, sums(LIVE), baselines, None, unit=unit)
-    return [line] if line else []
+    by_predictor = {headlines.MODEL: sums(LIVE), headlines.BASELINE: sums(LIVE_STILL)}
+    compared_live = headlines.score_table(steps, by_predictor, headlines.unit_of_model(forecaster.config))
+    return table.headlines(headlines.TASK, method, {Question(): compared_live})
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import Kind
-from tacpipe.report import blocks
+from tacpipe.printable import listed
 from tacpipe.report.blocks import Cell, Charts, Fold, number
 from tacpipe.report.context import Context, TaskReport
 from tacpipe.report.coverage import coverage_folds
@@ -122,6 +122,6 @@ def _look_ahead_notes(context: Context) -> list[str]:
         for note in dict.fromkeys(itertools.chain.from_iterable(notes)):
             names_by_note.setdefault(note, []).append(method.name)
     return [
-        note if len(names) == len(context.methods) else f"{blocks.listed(names)}: {note}"
+        note if len(names) == len(context.methods) else f"{listed(names)}: {note}"
         for note, names in names_by_note.items()
     ]

@@ -12,7 +12,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Question, Settings
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import from_parquet
 from tacpipe.report import context
@@ -232,10 +232,9 @@ def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
         if by_predictor:
             part = ", ".join(filter(None, (headline.PARTS[known_objects], timeline)))
             objects = object_clusters(run, known_objects)
-            cluster = headline.OBJECTS if objects else headline.RECORDINGS
-            measure = headline.measure(steps, headline.unit_of_model(config), cluster)
-            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = PredictorErrors(
-                measure, by_predictor, objects
+            unit = headline.unit_of_model(config)
+            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = headline.score_table(
+                steps, by_predictor, unit, objects
             )
     return ComparedRun(
         run.dataset,

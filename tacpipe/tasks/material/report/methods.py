@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-import numpy as np
 import pandas as pd
 
-from tacpipe.arrays import AnyFloats
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import Kind, PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Kind, Question, Settings
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
@@ -144,7 +142,7 @@ def _settings(run: MaterialResult) -> Settings:
     frozen = str(params.get("frozen_sensor", ""))
     joint = bool(config.get("joint", params.get("joint", False)))
     ratio = int(params.get("subsample_percent", 100))
-    shortened = run.epochs_of_paper if run.published else ""
+    shortened = run.epochs_of_paper
     omitted = {*_NO_METHOD, *(["epochs"] if shortened else []), *(() if joint or frozen else _PAIRS)}
     split, layout = run.place
     return {
@@ -213,12 +211,11 @@ def question_on(run: ComparedRun, sensor: str) -> Question | None:
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 
-def correct_by_recording(result: MaterialResult, sensor: str, predictor: str) -> dict[str, AnyFloats]:
-    """Return (correct, 1) for each slide of a sensor by recording, where correct is 1 or 0."""
+def right_by_recording(result: MaterialResult, sensor: str, predictor: str) -> dict[str, bool]:
+    """Return whether the material of each slide of a sensor is right, by recording."""
     rows = result.predictions
     rows = rows[(rows["sensor"] == sensor) & rows[predictor].notna()]
-    right = (rows[predictor] == rows["material"]).to_numpy(float)
-    return dict(zip(rows["recording"], np.column_stack([right, np.ones(len(rows))]), strict=True))
+    return dict(zip(rows["recording"], rows[predictor] == rows["material"], strict=True))
 
 
 def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
@@ -228,13 +225,9 @@ def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
     questions = {}
     for sensor in result.sensors:
         predictors = [name for name in predictions.PREDICTORS if name in result.predictions]
-        sums = {name: correct_by_recording(result, sensor, name) for name in predictors}
-        if classes:
-            sums[headline.CHANCE] = dict.fromkeys(sums[predictions.MODEL], np.array([1 / classes, 1.0]))
+        right = {name: right_by_recording(result, sensor, name) for name in predictors}
         part = ", ".join(filter(None, (sensor_title(sensor), place)))
-        questions[Question(part, place=int(settings["elsewhere"]))] = PredictorErrors(
-            headline.MEASURE, {name: predictor_sums for name, predictor_sums in sums.items() if predictor_sums}
-        )
+        questions[Question(part, place=int(settings["elsewhere"]))] = headline.score_table(right, classes)
     return ComparedRun(
         result.dataset,
         headline.TASK,

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from tacpipe.arrays import Ints
+from tacpipe.printable import format_count
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, counted, fixed, fold, notes, number, table
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fixed, fold, notes, number, table
 from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, median_run
 from tacpipe.scores.intervals import Estimate, wilson
@@ -46,7 +47,7 @@ def _confusion_chart(method: Method, sensor: str) -> Chart:
     spec = charts.matrix(counts, names, method.details[0].config.get("label", KEY), "named")
     spec["usermeta"] = {"most": 150 + 30 * len(names)}
     wrong = "; orange: wrong" if counts.trace() < counts.sum() else ""
-    runs = counted(len(runs_on(method, sensor)), "runs")
+    runs = format_count(len(runs_on(method, sensor)), "runs")
     caption = (
         f"{counts.trace()} of {counts.sum()} answers on unseen slides are right ({runs}). Blue: right{wrong}. The "
         "intensity is the fraction of the slides of a material."

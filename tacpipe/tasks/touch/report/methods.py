@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from tacpipe.arrays import AnyArray, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison import runs
-from tacpipe.comparison.runs import PredictorErrors, Question, Settings
+from tacpipe.comparison.runs import Question, Settings
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.plugins import params as params_of
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
-from tacpipe.scores import regression
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import GRASPS, MODEL, PREDICTIONS, TRUE
 from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, kind_of
@@ -129,7 +128,7 @@ class TouchResult(context.ReportResult[TouchConfig]):
             params.pop("wrist", None)  # unused
         if not params.get("multi_target", True):  # forests are one model of all targets
             params.pop("targets", None)  # one network per target: the other targets have no effect
-        if self.published and self.epochs_of_paper:
+        if self.epochs_of_paper:
             params[SHORTENED] = self.epochs_of_paper
             params.pop("epochs")
         split, simulated = self.split
@@ -193,18 +192,12 @@ def _run(run: TouchResult, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
             continue
         objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
         for target in rows.targets:
-            low, high = biotac_sp.RANGES[target]
-            sums = {
-                name: _sums_of_squares(target, rows.true[target], touch[target], rows.recordings.tolist())
-                for name, touch in rows.predicted.items()
-                if target in touch
-            }
-            measure = headline.measure(high - low, "grasps" if known_objects else "objects")
+            predicted = {name: touch[target] for name, touch in rows.predicted.items() if target in touch}
             part = headline.PARTS[known_objects]
             if len(splits) > 1:
                 part += f", {describe_split(*run.split)}"
-            questions[Question(part, headline.TARGETS[target], rank)] = PredictorErrors(
-                measure, sums, None if known_objects else objects
+            questions[Question(part, headline.TARGETS[target], rank)] = headline.score_table(
+                target, rows.true[target], predicted, rows.recordings.tolist(), objects, known_objects=known_objects
             )
     return ComparedRun(
         run.dataset,
@@ -217,10 +210,3 @@ def _run(run: TouchResult, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
         published=run.published,
         details=run,
     )
-
-
-def _sums_of_squares(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
-    """Return the sum of squares in fractions of the target's range and the number of values, by grasp."""
-    true_fractions, predicted_fractions = (biotac_sp.normalise(target, values) for values in (true, predicted))
-    squared = regression.squared_sums(true_fractions, predicted_fractions)
-    return {name: np.array([value, float(true_fractions.shape[1])]) for name, value in zip(names, squared, strict=True)}

@@ -72,7 +72,7 @@ def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> 
         "MAE t+3",
         "less squared error than persistence",
         "less error than persistence",
-        "sd over runs",
+        "sd over seeds",
         "MSE (counts²)",
         "MSE (scaled latents²)",
         "recordings",

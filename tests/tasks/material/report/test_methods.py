@@ -71,7 +71,7 @@ def test_a_name_states_that_a_network_was_trained_for_fewer_epochs_than_in_the_p
         "X-LSTM (30 of 2,000 epochs)": "X-LSTM",
         "RAEC independent": "RAEC independent",
     }
-    assert list(grouped(trained(150, joint=True, published=False))) == ["RAEC joint"]
+    assert list(grouped(trained(150, joint=True, published=False))) == ["RAEC joint (150 of 2,000 epochs)"]
 
 
 def test_settings_are_told_only_where_they_tell_methods_apart() -> None:

@@ -54,11 +54,11 @@ def test_a_name_states_that_the_papers_network_was_trained_for_fewer_epochs_than
     given = [result("pointnet", **options) for options in ({}, {"head": "fc1"}, {"published": False}, {"points": 250})]
     for short in given[1:3]:
         short.files["config.json"] = short.files["config.json"].replace(b'"epochs": 250', b'"epochs": 15')
-    assert [one.name for one in methods(*given)] == [
-        "PointNet",
-        "PointNet (15 of 250 epochs)",
-        "PointNet · epochs 15",  # the paper trained on no such recordings
+    assert [one.name for one in methods(*given)] == [  # also on recordings that are not the paper's
+        "PointNet (15 of 250 epochs) · head fc1",
+        "PointNet (15 of 250 epochs) · head fc3",
         "PointNet · points 250",
+        "PointNet · points 750",
     ]
 
 

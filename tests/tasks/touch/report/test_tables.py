@@ -28,7 +28,7 @@ def test_errors_are_in_shares_and_counts_with_r2_and_what_they_rest_on() -> None
 
     # √((0.04² + 0.06²)/2) of 900 counts, 1 - 0.0026/0.01
     assert of("RMSE")[0].startswith("0.05099 | ")
-    assert of("RMSE (counts)", "R²", "sd over runs", "grasps", "runs") == ["45.89", "0.74", "0.0141", "24", "2"]
+    assert of("RMSE (counts)", "R²", "sd over seeds", "grasps", "runs") == ["45.89", "0.74", "0.0141", "24", "2"]
     assert tables.groups[0].rows[0].kind == "best"
 
 
