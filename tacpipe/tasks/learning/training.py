@@ -14,6 +14,7 @@ from tacpipe.codecs import tactile
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW
 from tacpipe.printable import listed
 from tacpipe.tasks import recordings as recordings_of
@@ -52,7 +53,7 @@ def train(
     )
     rows = [inputs.place(training.recordings[name], streams) for name, streams in raw.items()]
     rows = examples_of.recentre(rows, params.recentre) if params.recentre else rows
-    group = [label.strip() for label in params.group.split(",") if label.strip()]
+    group = CommaList().items(params.group)
     whole = of_recordings and params.context_s is None
     examples = read_examples(inputs, rows, answers, group, params.stride, whole=whole)
     thinned = (
@@ -130,7 +131,7 @@ def input_columns(schema: pa.Schema, params: LearningParams, answers: ModelAnswe
     targets = set(answers.value_names)
     owners = {name: field_metadata(schema.field(name)).get("stream", "") for name in schema.names}
     own_streams = {owner for name, owner in owners.items() if name in targets and owner}
-    patterns = [word.strip() for word in params.inputs.split(",") if word.strip()]
+    patterns = CommaList().items(params.inputs)
     wanted = set(tactile.columns(schema, "tactile"))
     if patterns:
         wanted = {name for name in schema.names if any(fnmatchcase(name, pattern) for pattern in patterns)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.learning.task import LearnedTask
@@ -65,8 +66,7 @@ class RegressTask(LearnedTask):
         from tacpipe.tasks.learning import training
         from tacpipe.tasks.learning.answers import Quantities
 
-        patterns = [word.strip() for word in params.target.split(",") if word.strip()]
-        answers = Quantities.find(train, patterns, params.horizon_s)
+        answers = Quantities.find(train, CommaList().items(params.target), params.horizon_s)
         files, notes = training.train("regress", params, answers, train, workspace)
         return Result(files=files, notes=notes)
 
