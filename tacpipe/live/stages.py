@@ -15,7 +15,7 @@ from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import params, registry
-from tacpipe.plugins.stage import Attribute, RecordingOutput
+from tacpipe.plugins.stage import Attribute
 from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.synchronization.placement import are_arrivals, equal_fraction
@@ -78,14 +78,6 @@ class RecordingInMemory:
         return Columns(to_parquet(self.tables[stream]))
 
 
-@dataclass(frozen=True)
-class RecordingsInMemory:
-    """A dataset as a task reads it: recordings by name, and files."""
-
-    recordings: Mapping[str, RecordingInMemory]
-    files: Mapping[str, bytes] = field(default_factory=dict)
-
-
 def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
     """Return the streams of a recording. Raises `UsageError` if a stage has already processed it."""
     if set(recording.streams) == {""}:
@@ -139,24 +131,6 @@ def pieces_by_arrival(tables: Mapping[str, pa.Table], master: str) -> Iterator[t
         stops = {name: int(np.searchsorted(t_ns, until_ns, side="right")) for name, t_ns in stamps.items()}
         yield until_ns, {name: tables[name].slice(passed[name], stop - passed[name]) for name, stop in stops.items()}
         passed = stops
-
-
-def run_stages(recording: Recording, model: Dataset) -> Any:
-    """Run the stages of a model's chain on an original recording, and return the result."""
-    processed: Any = recording
-    for step in model.source.chain:
-        stage = registry.load(step["stage"])
-        arguments = {
-            name: processed if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
-            for name, kind in stage.arguments.items()
-        }
-        returned = stage(params.from_json(stage, step["params"]), **arguments)
-        output = returned if isinstance(returned, RecordingOutput) else RecordingOutput(returned)
-        tables = {
-            name: table.read_all() if hasattr(table, "read_all") else table for name, table in output.streams.items()
-        }
-        processed = RecordingInMemory(recording.name, tables, {**processed.attributes, **output.attributes})
-    return processed
 
 
 def live_channels(steps: Sequence[Step], layouts: Mapping[str, pa.Schema]) -> dict[str, LiveChannels]:

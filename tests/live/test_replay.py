@@ -2,13 +2,11 @@
 
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
 import tacpipe
 from tacpipe.tasks.forward.live.chain import LiveChain
-from tacpipe.tasks.forward.live.inputs import plan_table
 from tests.conftest import Lab
 from tests.live.sessions import CALIBRATED, TRAINED
 
@@ -66,14 +64,3 @@ def session(tables: dict[str, pa.Table]) -> list[Any]:
         chain.push(name, tables[name].slice(row, 1).to_batches()[0])
     forecasts += chain.advance(arrivals[-1][0])
     return [forecast for forecast in forecasts if forecast.count is not None]
-
-
-def test_a_plan_of_another_shape_or_order_is_refused_by_what_is_wrong() -> None:
-    for t_ns, poses, pattern in (
-        ([1, 2], np.zeros((2, 4)), r"\(2, 4\)"),
-        ([1], np.zeros((2, 3)), "1 times"),
-        ([2, 2], np.zeros((2, 3)), "ascend"),
-        ([1, 2], np.full((2, 3), np.nan), "finite"),
-    ):
-        with pytest.raises(tacpipe.TacpipeError, match=pattern):
-            plan_table(0, np.array(t_ns), poses)
