@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats
-from tacpipe.models.boosting import BoostedTrees, TreeSizes
+from tacpipe.models.boosting import BINS, BoostedTrees, TreeSizes
 from tacpipe.models.forest import Forest
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, FeatureKind, Kind, standardise
@@ -217,11 +217,12 @@ class FittedBoosting:
         learning_rate: float = 0.1,
         l2: float = 0.0,
         seed: int = 0,
+        bins: int = BINS,
     ) -> FittedBoosting:
         """Return trees of least absolute error, or of one class against the others."""
         rows = examples.features(features)
         rows = np.where(np.isnan(rows).all(axis=0), 0.0, rows)  # scikit-learn bins no column without values
-        sizes = TreeSizes(trees, leaves, leaf, learning_rate, l2, seed)
+        sizes = TreeSizes(trees, leaves, leaf, learning_rate, l2, seed, bins)
         if kind == "quantity":
             grown = [BoostedTrees.fit_values(rows, column, sizes) for column in outputs.T]
         else:

@@ -53,7 +53,7 @@ class RegressTask(LearnedTask):
     states = "quantiles"
 
     @staticmethod
-    @stage(version=1)
+    @stage(version=2)
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that estimates quantities from touch.
 

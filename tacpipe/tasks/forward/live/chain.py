@@ -117,7 +117,7 @@ class LiveChain:
         # channels computed from frames, by stream; None if the session's first frame, to which they refer, is missing
         self._cameras = dict(cameras or {})
         # indices, among the model's quantiles, of those that are published
-        self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
+        self._quantiles = forecaster.quantile_places(quantiles)
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize

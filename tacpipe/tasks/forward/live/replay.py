@@ -38,8 +38,7 @@ def predict(
     model reads.
     """
     forecaster = Forecaster.load(model.files)
-    if quantiles:
-        forecaster.quantiles_of(quantiles)
+    forecaster.quantile_places(quantiles)
     outputs: dict[str, RecordingOutput] = {}
     notes, unplanned, row_count = [], 0, 0
     with terminal.progress_bar("predict", len(recordings.recordings)) as advance:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import PositiveInt
 from tacpipe.plugins.stage import Attribute, Result
@@ -66,9 +66,9 @@ class ForwardLive(LiveTask):
         with settings.naming("steps"):
             steps = own_settings.steps_up_to(config["horizon"])
         levels = tuple(sorted(set(own_settings.quantiles)))
-        if levels:
-            with settings.naming("quantiles"):
-                _refuse_absent_quantiles(config, levels, task.quantiles_of)
+        calibrated = config.get("quantiles")
+        with settings.naming("quantiles"):
+            task.quantile_places(calibrated["levels"] if calibrated else (), levels)
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
         unit = str(config["inputs"].get("unit", "count"))
@@ -133,22 +133,3 @@ class ForwardLive(LiveTask):
 def _forward_settings(settings: Settings) -> ForwardSettings:
     assert isinstance(settings.task, ForwardSettings)
     return settings.task
-
-
-def _refuse_absent_quantiles(
-    config: ForwardConfig, levels: tuple[int, ...], find_quantiles: Callable[[Any, tuple[int, ...]], Any]
-) -> None:
-    """Raise `UsageError` for quantiles that the model does not have."""
-    description = config.get("quantiles")
-    calibrated_levels = CalibratedLevels(tuple(description["levels"]) if description else ())
-    try:
-        find_quantiles(calibrated_levels if calibrated_levels.percents else None, levels)
-    except TacpipeError as error:
-        raise UsageError(str(error)) from error
-
-
-@dataclass(frozen=True)
-class CalibratedLevels:
-    """The quantiles for which a model was calibrated."""
-
-    percents: tuple[int, ...]
