@@ -181,7 +181,7 @@ def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architectur
     (package / "lab.egg-info/entry_points.txt").write_text(
         "[tacpipe.models]\nregress.nearest = lab_estimator:Nearest\n"
     )
-    run_printed(project, "simulate forward --trials 4 --duration-s 3 -o data/f")
+    run_printed(project, "simulate forward --trials 4 --duration-s 4 -o data/f")
     run_printed(project, "synchronize data/f -o data/synced")
     run_printed(project, "split data/synced -o data/split --scheme random --val 0 --test 0.25")
     train = "train regress data/synced --split data/split -o models/m --architecture nearest --stride 10"
