@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.errors import UsageError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
@@ -23,6 +23,7 @@ from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChanne
 from tacpipe.video.depth import DepthChannels
 from tacpipe.video.stream import read_format
 
+SYNCHRONIZE = "synchronize"
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 PIECE_NS = 1_000_000_000  # duration of the pieces in which a recording is replayed
@@ -49,6 +50,30 @@ def stage_params(step: Step) -> Any:
             "prints for the model."
         )
     return params.from_json(stage, step["params"])
+
+
+def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Step]) -> None:
+    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
+
+    ``config`` is the model's configuration, ``steps`` are its preprocessing stages.
+    """
+    look_ahead = config.get("look_ahead")
+    if look_ahead is None:  # the recordings lack this information
+        interpolated = [
+            step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
+        ]
+        text = "their values are interpolated" if interpolated else ""
+    else:
+        text = (
+            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
+            if look_ahead["max_ms"]
+            else ""
+        )
+    if text:
+        raise TacpipeError(
+            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
+            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
+        )
 
 
 @dataclass(frozen=True)

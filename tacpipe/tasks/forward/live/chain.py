@@ -21,7 +21,7 @@ from tacpipe.io import Json
 from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory
 from tacpipe.live.rows import SynchronizedRows
-from tacpipe.live.stages import live_channels
+from tacpipe.live.stages import live_channels, refuse_look_ahead
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
@@ -34,7 +34,7 @@ from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.inputs import InputLayout
 from tacpipe.tasks.forward.live.plans import Targets, facing
-from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
+from tacpipe.tasks.forward.live.stages import causal_stages
 from tacpipe.video.channels import LiveChannels
 
 if TYPE_CHECKING:

@@ -54,7 +54,7 @@ class ForwardLive(LiveTask):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of forecasts and latencies, and the rig with a stream of plans if needed."""
         from tacpipe.live import plans
-        from tacpipe.tasks.forward.live.stages import refuse_look_ahead
+        from tacpipe.live.stages import refuse_look_ahead
 
         config: ForwardConfig = model_files.tree(
             model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list}

@@ -125,7 +125,7 @@ def causal_answers(
 
 def check_causal(chain: Sequence[Step], config: Mapping[str, Any], *, allow_look_ahead: bool) -> None:
     """Raise `TacpipeError` for a model of rows that a session cannot compute, or that looks ahead."""
-    from tacpipe.live.stages import stage_params
+    from tacpipe.live.stages import refuse_look_ahead
 
     require_stages(chain, CAUSAL)
     params = config["params"]
@@ -134,12 +134,8 @@ def check_causal(chain: Sequence[Step], config: Mapping[str, Any], *, allow_look
             f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Run "
             f"`tacpipe recentre MODEL RECORDINGS -o ADAPTED` on recordings of the session, and give the new model."
         )
-    synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
-    if synchronize is not None and synchronize.values == "interpolate" and not allow_look_ahead:
-        raise TacpipeError(
-            "The model was trained on rows whose values are interpolated, and a live session has no later samples. Train it "
-            "on rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
-        )
+    if not allow_look_ahead:
+        refuse_look_ahead(config, chain)
 
 
 def require_stages(chain: Sequence[Step], allowed: Collection[str] = ()) -> None:
