@@ -184,7 +184,7 @@ def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architectur
     run_printed(project, "simulate forward --trials 4 --duration-s 4 -o data/f")
     run_printed(project, "synchronize data/f -o data/synced")
     run_printed(project, "split data/synced -o data/split --scheme random --val 0 --test 0.25")
-    train = "train regress data/synced --split data/split -o models/m --architecture nearest --stride 10"
+    train = "train regress data/synced --split data/split -o models/m --architecture nearest --context-s 0"
     train += " --target gt_finger1_normal_n"
     evaluate = "evaluate models/m data/synced --split data/split -o results/m"
     assert json.loads(run_printed(project, train))["notes"] == json.loads(run_printed(project, evaluate))["notes"] == []

@@ -40,7 +40,7 @@ def test_what_a_session_published_is_what_predict_causal_writes_to_the_last_bit(
     ran = lab.call("predict models/f data/c -o data/after --causal")
     assert ran.code == 2 and "trial-000" in ran.err  # arrivals cannot be seen after a stage
     ran = lab.call("predict models/f data/r -o data/without --causal --quantiles 10")
-    assert ran.code == 1 and "tacpipe calibrate MODEL" in ran.err
+    assert ran.code == 2 and "tacpipe calibrate MODEL" in ran.err
     lab.run("predict models/f data/r -o data/without --steps 1,2 --causal")
     name = next(iter(predictions.recordings))
     without = tacpipe.open("data/without")[name].table()

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from tacpipe.tasks.learning.selection import CandidateLoss, CurvePoint, Fit
 
 
-BINS = 63  # maximum number of bins of a feature of boosted trees: half the time of 255, and errors that are no larger
 SIZES = ("trees", "leaf", "leaves", "learning_rate", "l2", "channels", "layers")  # params of the estimators
 GRADIENT_CLIP = 1.0  # maximum norm of the gradient of a network
 SCHEDULE = ("epochs", "batch", "patience", "weight_decay")  # params of the training of networks
@@ -88,7 +87,7 @@ class AutoEstimator(EstimatorParams):
             "linear": lambda examples, outputs, part: FittedLinear.fit(examples, outputs, self.KIND),
             "trees": lambda examples, outputs, part: FittedTrees.fit(examples, outputs, self.KIND, seed=self.seed),
             "boosting": lambda examples, outputs, part: FittedBoosting.fit(
-                examples, outputs, self.KIND, seed=self.seed, bins=BINS
+                examples, outputs, self.KIND, seed=self.seed
             ),
         }
 
@@ -125,7 +124,6 @@ class TreesEstimator(EstimatorParams):
 class BoostingEstimator(EstimatorParams):
     """Gradient-boosted trees on features of the window."""
 
-    BINS: ClassVar[int] = BINS
     trees: PositiveInt = 200  # number of trees
     leaves: Annotated[int, Range(2)] = 31  # maximum number of leaves of a tree
     leaf: PositiveInt = 20  # minimum number of windows per leaf
@@ -147,7 +145,6 @@ class BoostingEstimator(EstimatorParams):
                 learning_rate=self.learning_rate,
                 l2=self.l2,
                 seed=self.seed,
-                bins=self.BINS,
             )
         }
 

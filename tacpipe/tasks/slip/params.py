@@ -92,7 +92,6 @@ class SlipBoosting(BoostingEstimator, SlipParams):
 
     # boosting: gradient-boosted trees on features of each finger
     architecture: Literal["boosting"] = "boosting"
-    BINS: ClassVar[int] = 255  # its published areas were measured with these
     trees: PositiveInt = 100  # number of trees
     leaves: Annotated[int, Range(2)] = 6  # maximum number of leaves of a tree
     leaf: PositiveInt = 200  # minimum number of windows per leaf
