@@ -81,10 +81,7 @@ class ForwardLive(LiveTask):
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
-        """Return the engine with the model's causal chain, after a first forecast.
-
-        Raises `UsageError` for steps that the model does not predict.
-        """
+        """Return the engine with the model's causal chain, after a first forecast."""
         from tacpipe.live import plans
         from tacpipe.live.decoding import likely_schema
         from tacpipe.tasks.forward.forecaster import Forecaster
@@ -111,8 +108,6 @@ class ForwardLive(LiveTask):
             settle_ns=round(settings.settle_ms * 1e6),
             quantiles=own_settings.quantiles,
         )
-        if own_settings.steps and max(own_settings.steps) > engine.rows.horizon:
-            raise UsageError(f"The model predicts 1 to {engine.rows.horizon} steps ahead; give --steps of these.")
         forecaster.prepare_single()
         return engine
 
