@@ -25,7 +25,7 @@ from tacpipe.tasks.learning.estimators import FittedConstant, FittedLinear, Fitt
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.inputs import InputRows, Inputs, RawStream, find_inputs
 from tacpipe.tasks.learning.params import LearningParams
-from tacpipe.tasks.learning.selection import Fit
+from tacpipe.tasks.learning.selection import Fit, fit_with
 from tacpipe.tasks.learning.uncertainty import measure_uncertainty
 
 if TYPE_CHECKING:
@@ -190,14 +190,11 @@ def _require_learnable(answers: ModelAnswers, examples: Examples) -> ModelAnswer
 
 def _baseline_fits(params: LearningParams, examples: Examples, *, grouped: bool) -> dict[str, Fit]:
     """Return the baselines that apply: constant, mean of the group, last row, and the time since the start alone."""
-    kind = params.KIND
-    fits: dict[str, Fit] = {"constant": lambda part, outputs, name: FittedConstant.fit(part, outputs, kind)}
+    fits = {"constant": fit_with(FittedConstant, params.KIND)}
     if grouped:
-        fits["group_mean"] = lambda part, outputs, name: FittedConstant.fit(part, outputs, kind, by_group=True)
+        fits["group_mean"] = fit_with(FittedConstant, params.KIND, by_group=True)
     if np.ptp(examples.since_s) > 0:
-        fits["time_alone"] = lambda part, outputs, name: FittedTrees.fit(
-            part, outputs, kind, features="time", leaf=TIME_LEAF, seed=params.seed
-        )
+        fits["time_alone"] = fit_with(FittedTrees, params.KIND, features="time", leaf=TIME_LEAF, seed=params.seed)
     if any(stream.rows > 1 for stream in examples.inputs.streams):
-        fits["last_row"] = lambda part, outputs, name: FittedLinear.fit(part, outputs, kind, features="last")
+        fits["last_row"] = fit_with(FittedLinear, params.KIND, features="last")
     return fits
