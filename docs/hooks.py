@@ -25,7 +25,7 @@ BASE_CLASSES = {  # base class -> page with a complete example
     "tacpipe.tasks.task.Task": "task",
     "tacpipe.tasks.forward.params.ForwardModelParams": "model",
     "tacpipe.tasks.material.params.NetworkParams": "model",
-    "tacpipe.tasks.material.params.Estimator": "model",
+    "tacpipe.tasks.learning.params.LearningParams": "model",
     "tacpipe.codecs.codec.FittedCodec": "codec",
     "tacpipe.sensors.sensor.Sensor": "sensor",
     "tacpipe.trackers.tracking.Tracker": "tracker",

@@ -5,9 +5,8 @@ Prints a comparison of the model with the best baseline, with intervals over rec
 by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (their sums) and the predictions of each recording.
 Recordings that the model was trained on are reported separately, under ``seen``.
 
-``--live`` evaluates recordings of `tacpipe live -o`, which must be unprocessed. Published values are compared with the
-offline chain on the same recordings (``live`` in ``metrics.json``, ``live.csv``), and bit for bit with
-`predict --causal`.
+``--live`` evaluates what `tacpipe live -o` recorded: latencies, errors of published values, and which are those of
+`predict --causal` to the bit (``live`` in ``metrics.json``).
 
 Example: tacpipe evaluate models/forward data/segments --split data/split -o results/forward
 """
@@ -43,7 +42,7 @@ def prepare(params: Params) -> dict[str, Values] | None:
     return {} if params.live else None
 
 
-@stage(version=9, headline=headline.FILE)
+@stage(version=10, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Annotated[Dataset, prepare]) -> Result:
     """Evaluate a model on recordings with the metrics of its task."""
     from tacpipe.datasets import model_files

@@ -1,15 +1,11 @@
 """Architectures of other packages: choices like built-in ones, their version in keys, and why one does not fit."""
 
-import dataclasses
-import io
 import json
 import sys
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tacpipe.errors import ResultWarning, TacpipeError
@@ -19,12 +15,11 @@ from tests.conftest import Ran, forget, run_python, write_plugin
 
 MODULE = '''
 from dataclasses import dataclass
-from subprocess import run  # which no file of a model may name through this module
 from typing import Any, Literal
 
 from tacpipe.plugins.constraints import PositiveInt
 from tacpipe.tasks.forward.params import ForwardModelParams
-from tacpipe.tasks.material.params import Estimator, MaterialModelParams, NetworkParams
+from tacpipe.tasks.material.params import MaterialModelParams, NetworkParams
 from tacpipe.tasks.touch.params import Patches
 
 
@@ -73,44 +68,6 @@ class Scores(NetworkParams):
                 return self.layer(frames.mean(dim=0))
 
         return Mean()
-
-
-@dataclass(frozen=True)
-class Nearest(Estimator):
-    """The nearest mean."""
-
-    architecture: Literal["nearest"] = "nearest"
-
-    def features(self, frames):
-        """Return the mean of each channel."""
-        return frames.mean(axis=1)
-
-    def build(self, seed):
-        """Return the estimator."""
-        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-
-        return LinearDiscriminantAnalysis(solver="lsqr", shrinkage=0.5)
-
-
-@dataclass(frozen=True)
-class Forest(Nearest):
-    """A forest, whose trees skops does not validate."""
-
-    architecture: Literal["forest"] = "forest"
-
-    def build(self, seed):
-        """Return the estimator."""
-        from sklearn.ensemble import RandomForestClassifier
-
-        return RandomForestClassifier(3, random_state=seed)
-
-
-@dataclass(frozen=True)
-class Trusting(Forest):
-    """A forest that is trusted."""
-
-    TRUSTED = ("sklearn.tree._tree.Tree",)
-    architecture: Literal["trusting"] = "trusting"
 
 
 @dataclass(frozen=True)
@@ -174,9 +131,6 @@ forward.double = lab_architectures:Double
 forward.odd = lab_architectures:Odd
 forward.lost = nowhere_at_all:Lost
 material.scores = lab_architectures:Scores
-material.nearest = lab_architectures:Nearest
-material.forest = lab_architectures:Forest
-material.trusting = lab_architectures:Trusting
 material.majority = lab_architectures:Majority
 material.unfinished = lab_architectures:Unfinished
 touch.flat = lab_architectures:Flat
@@ -299,99 +253,18 @@ def test_a_forward_network_is_trained_stored_and_read_back_and_another_shape_is_
         trials.trained(tmp_path / "wrong", architecture="plain", returned="wrong", epochs=1)
 
 
-def slides(seed: int) -> tuple[Any, Any]:
-    """Return slides (slide, time, channel) of three materials that differ in level."""
-    rng = np.random.default_rng(seed)
-    materials = np.arange(30) % 3
-    return (rng.normal(size=(30, 8, 4)) + materials[:, None, None]).astype(np.float32), materials.astype(np.int64)
-
-
-def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_bytes(package: Path) -> None:
-    from tacpipe.tasks.material import estimators
-
-    params = build_train_params("material", architecture="nearest")
-    frames, materials = slides(0)
-    fitted, refitted = (estimators.FittedEstimator.fit(params, frames, materials) for _ in range(2))
-    content = estimators.pack_estimators({"biotac": fitted}, params)
-    assert content == estimators.pack_estimators({"biotac": refitted}, params)
-    assert b"pickle" not in content
-    read = estimators.unpack_estimators(content, "model.skops", params)["biotac"]
-    assert np.array_equal(read.scores(slides(1)[0]), fitted.scores(slides(1)[0]))
-    assert read.classes == (0, 1, 2)
-    assert (fitted.scores(frames).argmax(axis=1) == materials).mean() > 0.8
-    with pytest.raises(TacpipeError, match=r"model\.skops is not a file of skops"):
-        estimators.unpack_estimators(content[:-30], "model.skops", params)
-
-
-def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_packages_run_nothing(
-    package: Path,
-) -> None:
-    from tacpipe.tasks.material import estimators
-
-    params = build_train_params("material", architecture="nearest")
-    frames, materials = slides(0)
-    content = estimators.pack_estimators({"biotac": estimators.FittedEstimator.fit(params, frames, materials)}, params)
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        changed = bytearray(content)
-        changed[rng.integers(len(changed))] ^= int(rng.integers(1, 256))
-        try:
-            estimators.unpack_estimators(bytes(changed), "model.skops", params)
-        except TacpipeError as error:
-            assert "model.skops" in str(error)
-    with zipfile.ZipFile(io.BytesIO(content)) as file:
-        members = {name: file.read(name) for name in file.namelist()}
-    for module, name in (("os", "system"), (type(params).__module__, "run")):
-        call = {"__class__": name, "__module__": module, "__loader__": "FunctionNode", "__id__": 1, "content": name}
-        archive, described = io.BytesIO(), json.loads(members["schema.json"])
-        with zipfile.ZipFile(archive, "w") as file:
-            for member, data in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
-                file.writestr(member, data)
-        with pytest.raises(TacpipeError, match=rf"holds {module}\.{name}"):
-            estimators.unpack_estimators(archive.getvalue(), "model.skops", params)
-
-
-def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:
-    from tacpipe.tasks.material import estimators
-
-    frames, materials = slides(0)
-    forest, trusting = (build_train_params("material", architecture=name) for name in ("forest", "trusting"))
-    fitted = {"biotac": estimators.FittedEstimator.fit(forest, frames, materials)}
-    with pytest.raises(TacpipeError, match=r"sklearn\.tree\._tree\.Tree"):
-        estimators.pack_estimators(fitted, forest)
-    content = estimators.pack_estimators(fitted, trusting)
-    assert np.array_equal(
-        estimators.unpack_estimators(content, "model.skops", trusting)["biotac"].scores(frames),
-        fitted["biotac"].scores(frames),
-    )
-    with pytest.raises(TacpipeError, match=r"holds sklearn\.tree\._tree\.Tree"):
-        estimators.unpack_estimators(content, "model.skops", forest)
-
-
-def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None:
-    from tacpipe.tasks.material import estimators
-
-    params = build_train_params("material", architecture="nearest")
-    frames, materials = slides(0)
-    fitted = estimators.FittedEstimator.fit(params, frames, materials)
-    with pytest.raises(TacpipeError, match=r"30 slides are \(8, 4\)"):
-        dataclasses.replace(fitted, features=lambda values: values.mean(axis=0)).scores(frames)
-    with pytest.raises(TacpipeError, match="not all finite"):
-        dataclasses.replace(fitted, features=lambda values: values.mean(axis=1) * np.nan).scores(frames)
-
-
 def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package: Path) -> None:
     import torch
 
     from tacpipe.models.recurrent_autoencoder import AutoencoderShape
-    from tacpipe.tasks.material import estimators
+    from tacpipe.tasks.material import networks
     from tacpipe.tasks.touch import members
 
     scores = build_train_params("material", architecture="scores")
-    scores_network = estimators.build_network(scores, AutoencoderShape(channels=4, classes=3))
-    estimators.check_network(scores_network, scores, torch.zeros(5, 8, 4), 3)
+    scores_network = networks.build_network(scores, AutoencoderShape(channels=4, classes=3))
+    networks.check_network(scores_network, scores, torch.zeros(5, 8, 4), 3)
     with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
-        estimators.check_network(scores_network, scores, torch.zeros(5, 8, 4), 4)
+        networks.check_network(scores_network, scores, torch.zeros(5, 8, 4), 4)
     flat = build_train_params("touch", architecture="flat")
     network = members.network(flat, ["pdc_th"])
     read = flat.point_inputs
@@ -411,10 +284,13 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
 
 
 def test_reports_name_an_architecture_as_its_class_states_it_and_others_by_their_choice(package: Path) -> None:
-    from tacpipe.tasks.material.params import kind_of
+    from tacpipe.tasks.material.params import Params
 
-    titles = [kind_of(name).TITLE or name for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")]
-    assert titles == ["RAEC", "X-LSTM", "statistics", "nearest", "uninstalled"]
+    titles = [
+        architectures.find_or(Params, name).TITLE or name
+        for name in ("raec", "x-lstm", "statistics", "scores", "uninstalled")
+    ]
+    assert titles == ["RAEC", "X-LSTM", "statistics", "scores", "uninstalled"]
 
 
 def test_a_codec_that_is_not_installed_is_named_with_its_package() -> None:

@@ -72,29 +72,25 @@ ESTIMATOR = '''
 
 from dataclasses import dataclass
 from typing import Any, Literal
-from tacpipe.tasks.material.params import Estimator
+from tacpipe.tasks.regress.params import RegressParams
 
 
 @dataclass(frozen=True)
-class Nearest(Estimator):
-    """The nearest mean."""
+class Nearest(RegressParams):
+    """A regression."""
 
-    architecture: Literal["nearest"] = "nearest"  # nearest: the nearest mean
+    architecture: Literal["nearest"] = "nearest"  # nearest: a regression
 
-    def features(self, frames: Any) -> Any:
-        """Return means (slide, channel)."""
-        return frames.mean(axis=1)
-
-    def build(self, seed: int) -> Any:
-        """Return the estimator, not fitted."""
+    def candidates(self, workspace: Any) -> Any:
+        """Return the regression."""
         import lab_helper
 
-        return lab_helper.estimator()
+        return {"nearest": lab_helper.fit}
 '''
-BAYES = """
-def estimator():
-    from sklearn.naive_bayes import GaussianNB
-    return GaussianNB()
+HELPER = """
+def fit(examples, outputs, part):
+    from tacpipe.tasks.learning.estimators import FittedLinear
+    return FittedLinear.fit(examples, outputs, "quantity", features="last")
 """
 
 
@@ -180,18 +176,19 @@ def test_a_hit_names_the_package_of_which_a_module_was_edited_that_the_stage_imp
 def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architecture(project: Path) -> None:
     package = project / "package"
     (package / "lab_estimator.py").write_text(ESTIMATOR)
-    (package / "lab_helper.py").write_text(BAYES)
+    (package / "lab_helper.py").write_text(HELPER)
     (package / "lab.egg-info/top_level.txt").write_text("lab_estimator\nlab_helper\n")
     (package / "lab.egg-info/entry_points.txt").write_text(
-        "[tacpipe.models]\nmaterial.nearest = lab_estimator:Nearest\n"
+        "[tacpipe.models]\nregress.nearest = lab_estimator:Nearest\n"
     )
-    run_printed(project, "simulate material --trials 12 --materials 2 -o data/m")
-    run_printed(project, "segment slides data/m -o data/slides")
-    run_printed(project, "split data/slides -o data/split --scheme random --stratify material")
-    train = "train material data/slides --split data/split -o models/m --architecture nearest"
-    evaluate = "evaluate models/m data/slides --split data/split -o results/m"
+    run_printed(project, "simulate forward --trials 4 --duration-s 4 -o data/f")
+    run_printed(project, "synchronize data/f -o data/synced")
+    run_printed(project, "split data/synced -o data/split --scheme random --val 0 --test 0.25")
+    train = "train regress data/synced --split data/split -o models/m --architecture nearest --context-s 0"
+    train += " --target gt_finger1_normal_n"
+    evaluate = "evaluate models/m data/synced --split data/split -o results/m"
     assert json.loads(run_printed(project, train))["notes"] == json.loads(run_printed(project, evaluate))["notes"] == []
-    edit(project, "GaussianNB()", "GaussianNB(var_smoothing=0.5)", "lab_helper")
+    edit(project, '"last"', '"statistics"', "lab_helper")
     for command in (train, evaluate):
         assert any(
             "other code of the package lab " in note for note in json.loads(run_printed(project, command))["notes"]

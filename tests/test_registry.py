@@ -135,9 +135,9 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
     # words of data too: a role, kinds of dataset, a message of HID, a key of Croissant's JSON
     data = {"split", "train", "report", "export", "extract"}
     stage_names = {*registry.stages(), *registry.commands()} - data
-    # the command line has aliases, groups of commands and a first try of several, guesses name the commands that do what is meant, an export of
-    # frames runs synchronize before it, the viewer reads the thresholds of contacts and the pitch of markers, and a live
-    # session extracts channels of cameras and reads the params of an earlier version of synchronize
+    # the command line has aliases, groups of commands and a first try of several, guesses name the commands that do what is
+    # meant, an export of frames runs synchronize before it, the viewer reads the thresholds of contacts and the pitch of
+    # markers, and a live session extracts channels of cameras and reads the params of an earlier version of synchronize
     needed = {
         "cli/first_try.py",
         "cli/guesses.py",

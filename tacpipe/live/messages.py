@@ -150,9 +150,14 @@ class Description:
         }
         return {"version": {"type": "integer"}, "kind": {"type": "string"}, **fields}
 
+    @property
+    def details(self) -> JsonObject:
+        """What it states beside the kind of the messages, for JSON and msgpack."""
+        raise NotImplementedError
+
     def to_dict(self) -> JsonObject:
         """Return the description for JSON and msgpack."""
-        raise NotImplementedError
+        return {"version": VERSION, "kind": "description", "of": self.kind, **self.details}
 
 
 def head_values() -> tuple[Value, ...]:

@@ -10,12 +10,12 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.errors import UsageError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import params, registry
-from tacpipe.plugins.stage import Attribute, RecordingOutput
+from tacpipe.plugins.stage import Attribute
 from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.synchronization.placement import are_arrivals, equal_fraction
@@ -23,6 +23,7 @@ from tacpipe.video.channels import DifferenceChannels, FrameChannels, LiveChanne
 from tacpipe.video.depth import DepthChannels
 from tacpipe.video.stream import read_format
 
+SYNCHRONIZE = "synchronize"
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 PIECE_NS = 1_000_000_000  # duration of the pieces in which a recording is replayed
@@ -51,6 +52,30 @@ def stage_params(step: Step) -> Any:
     return params.from_json(stage, step["params"])
 
 
+def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Step]) -> None:
+    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
+
+    ``config`` is the model's configuration, ``steps`` are its preprocessing stages.
+    """
+    look_ahead = config.get("look_ahead")
+    if look_ahead is None:  # the recordings lack this information
+        interpolated = [
+            step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
+        ]
+        text = "their values are interpolated" if interpolated else ""
+    else:
+        text = (
+            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
+            if look_ahead["max_ms"]
+            else ""
+        )
+    if text:
+        raise TacpipeError(
+            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
+            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
+        )
+
+
 @dataclass(frozen=True)
 class RecordingInMemory:
     """A recording as a stage reads it, with its tables in memory."""
@@ -76,14 +101,6 @@ class RecordingInMemory:
     def columns(self, stream: str = "") -> Columns:
         """Return the columns of a stream, as those of a stored recording."""
         return Columns(to_parquet(self.tables[stream]))
-
-
-@dataclass(frozen=True)
-class RecordingsInMemory:
-    """A dataset as a task reads it: recordings by name, and files."""
-
-    recordings: Mapping[str, RecordingInMemory]
-    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
@@ -139,24 +156,6 @@ def pieces_by_arrival(tables: Mapping[str, pa.Table], master: str) -> Iterator[t
         stops = {name: int(np.searchsorted(t_ns, until_ns, side="right")) for name, t_ns in stamps.items()}
         yield until_ns, {name: tables[name].slice(passed[name], stop - passed[name]) for name, stop in stops.items()}
         passed = stops
-
-
-def run_stages(recording: Recording, model: Dataset) -> Any:
-    """Run the stages of a model's chain on an original recording, and return the result."""
-    processed: Any = recording
-    for step in model.source.chain:
-        stage = registry.load(step["stage"])
-        arguments = {
-            name: processed if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
-            for name, kind in stage.arguments.items()
-        }
-        returned = stage(params.from_json(stage, step["params"]), **arguments)
-        output = returned if isinstance(returned, RecordingOutput) else RecordingOutput(returned)
-        tables = {
-            name: table.read_all() if hasattr(table, "read_all") else table for name, table in output.streams.items()
-        }
-        processed = RecordingInMemory(recording.name, tables, {**processed.attributes, **output.attributes})
-    return processed
 
 
 def live_channels(steps: Sequence[Step], layouts: Mapping[str, pa.Schema]) -> dict[str, LiveChannels]:

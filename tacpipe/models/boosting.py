@@ -15,7 +15,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Int32s
 from tacpipe.models.forest import LEAF, node_checks
 
-BINS = 255  # bins of a feature
+BINS = 255  # maximum number of bins of a feature
 SAMPLED_ROWS = 200_000  # rows above which scikit-learn bins a sample of them, without weights
 
 
@@ -29,6 +29,7 @@ class TreeSizes:
     learning_rate: float
     l2: float  # penalty on leaf values
     seed: int
+    bins: int = BINS  # maximum number of bins of a feature
 
     def options(self) -> dict[str, Any]:
         """Return the options of scikit-learn's estimators."""
@@ -40,6 +41,7 @@ class TreeSizes:
             "l2_regularization": self.l2,
             "early_stopping": False,
             "random_state": self.seed,
+            "max_bins": self.bins,
         }
 
 
@@ -72,7 +74,7 @@ class BoostedTrees:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         model = HistGradientBoostingClassifier(**sizes.options())
-        edges = [bin_edges(column, weights) for column in rows.T] if len(rows) <= SAMPLED_ROWS else []
+        edges = [bin_edges(column, weights, sizes.bins) for column in rows.T] if len(rows) <= SAMPLED_ROWS else []
         model.fit(_bin_rows(rows, edges) if edges else rows, labels, sample_weight=weights)
         return cls._of_model(model, edges)
 
@@ -157,7 +159,7 @@ class BoostedTrees:
         return trees
 
 
-def bin_edges(values: AnyFloats, weights: AnyFloats) -> Floats:
+def bin_edges(values: AnyFloats, weights: AnyFloats, bins: int = BINS) -> Floats:
     """Return the ascending upper edges of all bins of a feature but the last, of values (row,) with weights (row,).
 
     Bins have about equal weight. The edges are those of scikit-learn, which sorts all rows again for each edge.
@@ -166,10 +168,10 @@ def bin_edges(values: AnyFloats, weights: AnyFloats) -> Floats:
     order = np.argsort(values[counted])
     ordered, mass = values[counted][order], weights[counted][order]
     distinct = np.unique(ordered)
-    if len(distinct) <= BINS:
+    if len(distinct) <= bins:
         return np.asarray((distinct[:-1] + distinct[1:]) / 2)
     total = np.cumsum(mass)
-    targets = np.linspace(0, 100, BINS + 1)[1:-1] / 100 * total[-1]
+    targets = np.linspace(0, 100, bins + 1)[1:-1] / 100 * total[-1]
     last = len(ordered) - 1
     crossings = np.minimum(np.searchsorted(total, targets), last)
     between = (ordered[crossings] + ordered[np.minimum(crossings + 1, last)]) / 2

@@ -247,13 +247,6 @@ class MinirocketClassifier:
         patterns = Rocket.fit(wide, features=features, seed=seed)
         return cls(patterns, *_fit_readout(patterns.transform(wide), _strength(wide), labels))
 
-    def with_labels(self, x: AnyFloats, labels: Ints) -> MinirocketClassifier:
-        """Return a classifier with the same patterns, with its readout fitted to slides ``x`` and other ``labels``."""
-        wide = with_profile(x)
-        return MinirocketClassifier(
-            self.patterns, *_fit_readout(self.patterns.transform(wide), _strength(wide), labels)
-        )
-
     @property
     def classes(self) -> Int32s:
         """The classes (class,), in the order of the scores."""

@@ -14,7 +14,8 @@ and their classes are the kinds of params of the task's stage (`tacpipe.plugins.
 - The shared loop of the task trains the result of ``build``, unless the architecture has its own method ``fit``. So
   no task depends on which architecture it trains.
 - Each task documents the arguments and the result of ``build``: `tacpipe.tasks.forward.params.ForwardModelParams`,
-  `tacpipe.tasks.material.params.Estimator` and `NetworkParams`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
+  `tacpipe.tasks.material.params.NetworkParams`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`. Architectures of
+  ``classify`` and ``regress`` return estimators instead (`tacpipe.tasks.learning.params`).
 """
 
 from __future__ import annotations
@@ -84,6 +85,11 @@ def load(base: Kind, name: str) -> Kind:
 def find(base: Any, architecture: str) -> Kind | None:
     """Return the class of an architecture that extends ``base``, or None if its package is not installed."""
     return next((kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG)), None)
+
+
+def find_or(base: Any, architecture: str) -> Kind:
+    """Return the class of an architecture that extends ``base``, or ``base`` if its package is not installed."""
+    return find(base, architecture) or base
 
 
 def require(base: Any, value: Any) -> None:

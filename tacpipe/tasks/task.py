@@ -14,9 +14,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.plugins.model import CalibrationRequest as CalibrationRequest
 from tacpipe.plugins.model import Files as Files
@@ -139,18 +139,6 @@ def task_of_model(files: Files, place: str = "This") -> Task:
     return task
 
 
-class Levelled(Protocol):
-    """Uncertainty of a model by quantiles."""
-
-    @property
-    def percents(self) -> tuple[int, ...]:
-        """Quantile levels in percent, ascending."""
-        ...  # a protocol has no body
-
-
-Uncertain = TypeVar("Uncertain", bound=Levelled)
-
-
 def percents(levels: AnyFloats) -> tuple[int, ...]:
     """Return levels, which are fractions, in percent.
 
@@ -161,21 +149,20 @@ def percents(levels: AnyFloats) -> tuple[int, ...]:
     return tuple(round(float(100 * level)) for level in levels)
 
 
-def quantiles_of(uncertainty: Uncertain | None, requested: Sequence[int]) -> tuple[Uncertain, list[int]]:
-    """Return a model's uncertainty, and the indices of the ``requested`` quantiles in percent.
+def quantile_places(available: Sequence[int], requested: Sequence[int]) -> list[int]:
+    """Return the places of ``requested`` quantiles in percent among those that a model has.
 
-    Raises `TacpipeError` if the model has no uncertainty or lacks one of these quantiles.
+    Raises `UsageError` if the model has no uncertainty or lacks one of these quantiles.
     """
-    if uncertainty is None:
-        raise TacpipeError(
+    if requested and not available:
+        raise UsageError(
             "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
             "that one."
         )
-    available = uncertainty.percents
     for percent in requested:
         if percent not in available:
-            raise TacpipeError(
+            raise UsageError(
                 f"The model has the quantiles {','.join(map(str, available))}, not {percent}. Give --quantiles of "
                 "these, or run `tacpipe calibrate` with others."
             )
-    return uncertainty, [available.index(percent) for percent in requested]
+    return [available.index(percent) for percent in requested]

@@ -11,6 +11,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.sensors import plan
 from tacpipe.store.records import Step
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
@@ -53,6 +54,16 @@ def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0, *, wraps: bo
             pose = [0.5 + x, zero, 0.3 + x / 2, zero, zero, np.sin(half), np.cos(half)]
             streams["robot"] = schema.stream(t_ns, np.array(pose) * np.sign(half + 10)[None], fields)
     return FakeRecording(streams, f"trial-{seed:03d}")
+
+
+def plan_table(arrived_ns: int, t_ns: Any, poses: Any) -> pa.Table:
+    """Return a plan as its stream has it, from ``poses`` (point, 3 or 7) at times ``t_ns`` (point,)."""
+    rows = np.full((len(poses), plan.NUMBERS), np.nan)
+    rows[:, : np.shape(poses)[1]] = poses
+    arrays = [np.full(len(t_ns), arrived_ns, np.int64), np.asarray(t_ns, np.int64), *rows.T]
+    return pa.Table.from_arrays(
+        list(map(pa.array, arrays)), schema=pa.schema([schema.time_field(), *plan.Plan().fields()])
+    )
 
 
 def stage(name: str, recording: Any, **values: Any) -> FakeShard:

@@ -225,7 +225,7 @@ def test_a_plan_is_read_from_its_arrival_and_replaces_the_plan_before(models: di
         for arrived_ns, far_m in plans:
             t_ns = arrived_ns + np.arange(3) * 500 * MS
             poses = np.column_stack([np.linspace(0.5, 0.5 + far_m, 3), np.zeros(3), np.full(3, 0.3)])
-            fed.plan(arrived_ns, t_ns, poses)
+            fed.push("plan", rigs.plan_table(arrived_ns, t_ns, poses))
         return {forecast.t_ns: forecast for forecast in fed.advance(T0 + 2990 * MS) if forecast.count is not None}
 
     without, once, twice = (
@@ -275,7 +275,7 @@ def test_the_recorded_motion_as_a_plan_gives_the_forecasts_of_evaluate_at_any_ra
         fed.push(name, table)
     pose = panda(120)[0]
     for row in range(119):
-        fed.plan(int(track.t_ns[row]), track.t_ns[row : row + 5], pose[row : row + 5])
+        fed.push("plan", rigs.plan_table(int(track.t_ns[row]), track.t_ns[row : row + 5], pose[row : row + 5]))
     live = {forecast.t_ns: forecast for forecast in fed.advance(int(track.t_ns[-1])) if forecast.count is not None}
     (batch,) = forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
     at_ns = track.t_ns[batch.now].tolist()

@@ -1,5 +1,6 @@
 """Test `tacpipe evaluate --live`, which compares a session's messages with the offline chain on the same recording."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,7 @@ from tacpipe.live import messages
 from tacpipe.live.preparation import open_model
 from tacpipe.live.stages import MODEL, require_sessions
 from tacpipe.tasks.forward.live import evaluation
-from tacpipe.tasks.forward.live import measures as truth
-from tacpipe.tasks.forward.live import measures as worth
+from tacpipe.tasks.forward.live.chain import Cause, GridForecast
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
 from tests.live.sessions import CALIBRATED, TRAINED
@@ -42,7 +42,7 @@ def record(recording: Any, predictions: pa.Table) -> FakeRecording:
 
 
 @pytest.mark.long
-def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(lab: Lab) -> None:
+def test_published_forecasts_are_compared_with_recomputed_ones_and_with_the_rows_that_they_are_for(lab: Lab) -> None:
     for command in (*TRAINED, CALIBRATED):
         lab.run(command)
     lab.run("predict models/g data/r -o data/p --steps 1,2 --causal --quantiles 10,90")
@@ -51,17 +51,15 @@ def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(
     recordings: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
     result = evaluation.evaluate(model, recordings)
     live = json.loads(result.files["metrics.json"])["live"]
-    rows = live["rows"]
-    assert rows["compared"] == rows["published"] == rows["recomputed"] == session.table("forecast").num_rows
-    assert rows["equal"] == rows["compared"] - 2 and rows["differ_after_late_samples"] == 2
+    measured = live["recordings"][name]
+    assert live["compared"] == live["published"] == session.table("forecast").num_rows
+    assert live["equal"] == live["compared"] - 2
     uncalibrated = json.loads(evaluation.evaluate(tacpipe.open("models/f"), recordings).files["metrics.json"])["live"]
-    assert uncalibrated["rows"]["equal"] == rows["compared"] - 1  # the uncalibrated model has no quantiles to compare
-    assert rows["late_samples"] == 1 and rows["skipped"] == 0 and 0 < rows["of_errors"] < rows["published"]
-    assert live["latency"]["median_ms"] == LATENCY_MS
-    assert set(live["mae"]) == set(worth.PREDICTORS)
-    assert 0 < live["mae"]["live"]["t1"] < 10 * live["mae"]["offline"]["t1"]
-    assert len(result.files["live.csv"].decode().splitlines()) == 1 + len(worth.PREDICTORS)
-    assert "bit for bit" in result.notes[-2] and "2 others" in result.notes[-2]
+    assert uncalibrated["equal"] == live["compared"] - 1  # the uncalibrated model has no quantiles to compare
+    assert (measured["late"], measured["skipped"]) == (1, 0) and measured["latency"]["median_ms"] == LATENCY_MS
+    assert set(measured["mae"]) == {"live", "persistence"} and 0 < measured["errors_of"]["t1"] < live["published"]
+    assert 0 < measured["mae"]["live"]["t1"] < 10 * measured["mae"]["persistence"]["t1"]
+    assert "bit for bit" in result.notes[0] and "latency median 5.0 ms" in result.notes[1]
 
 
 class Session:
@@ -105,37 +103,20 @@ def test_a_recording_without_a_session_is_refused(lab: Lab) -> None:
     assert ran.code == 2 and "tacpipe live -o" in ran.err and not Path("results/live").exists()
 
 
-def test_rows_are_compared_bit_for_bit_and_only_where_both_have_them() -> None:
-    published = np.array([[[1.0]], [[2.0]], [[3.0]], [[np.nan]]], np.float32)
-    recomputed = np.array([[[2.0]], [[3.0 + 2**-20]], [[np.nan]], [[9.0]]], np.float32)
-    result, equal = truth.equality(np.array([10, 20, 30, 40]), published, np.array([20, 30, 40, 50]), recomputed)
-    assert (result.published, result.recomputed, result.compared, result.equal) == (4, 4, 3, 2)
-    assert equal.tolist() == [False, True, False, True]
-    assert 0 < result.largest_difference < 1e-6
-
-
-def test_minus_zero_is_not_zero() -> None:
-    zero, minus_zero = np.zeros((1, 1, 1), np.float32), -np.zeros((1, 1, 1), np.float32)
-    assert truth.equality(np.array([0]), zero, np.array([0]), minus_zero)[0].equal == 0
-
-
-def test_nothing_is_interpolated_over_a_gap_or_an_unusable_row() -> None:
-    t_ns, values = np.arange(5) * 10, np.arange(5.0)[:, None]
-    groups, usable = np.array([0, 0, 1, 1, 1]), np.array([True, True, True, False, True])
-    result = truth.interpolate(t_ns, values, groups, usable, np.array([-1, 0, 4, 15, 20, 25, 40, 41]))[:, 0]
-    assert np.array_equal(result, [np.nan, 0, 0.4, np.nan, 2, np.nan, 4, np.nan], equal_nan=True)
-
-
-def test_steps_are_periods_on_a_uniform_grid_and_rows_on_another() -> None:
-    rows = np.array([0, 21, 39, 60])
-    assert truth.targets(rows, np.array([0, 39]), (1, 3), 20.0).tolist() == [[20, 60], [59, 99]]
-    assert truth.targets(rows, np.array([0, 39]), (1, 3), None).tolist() == [[21, 60], [60, -1]]
-
-
-def test_errors_are_summed_over_rows_and_channels() -> None:
-    predicted = np.array([[[1.0, 2.0]], [[3.0, 5.0]]])
-    squared, absolute = truth.sums(predicted, np.zeros((2, 1, 2)))
-    assert squared.tolist() == [39.0] and absolute.tolist() == [11.0]
+def test_a_forecast_is_compared_with_the_row_that_it_is_for_unless_one_of_both_is_in_a_gap() -> None:
+    levels = (0.0, 2.0, 5.0, None, 9.0)  # of a channel in the rows of a grid; None: before the level at rest is known
+    rows = [
+        GridForecast(10 * number, 0, None, None if level is None else np.array([level], np.float32), Cause.NONE)
+        for number, level in enumerate(levels)
+    ]
+    times, published = np.array([0, 10, 20, 35]), {"z_t1": np.array([1.0, 2.5, 0.0, 0.0], np.float32)}
+    assert evaluation.errors(rows, times, published, ["z"]) == {
+        "mae": {"live": {"t1": 1.75}, "persistence": {"t1": 2.5}},
+        "errors_of": {"t1": 2},
+    }
+    rows[2] = dataclasses.replace(rows[2], gaps=("xela1",))
+    in_gap = evaluation.errors(rows, times, published, ["z"])
+    assert in_gap["mae"]["live"] == {"t1": 1.0} and in_gap["errors_of"] == {"t1": 1}
 
 
 def test_latencies_of_no_forecast_are_a_count() -> None:

@@ -27,7 +27,7 @@ from tacpipe.simulation.slide import SlideRig, simulate_trial
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import network_training, sensor_calibration
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.live import slide as material_replay
+from tacpipe.tasks.material.live import slides as material_replay
 from tacpipe.tasks.material.live.engine import MaterialEngine
 from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.tasks.material.live.slide import UNLIKE

@@ -51,7 +51,7 @@ def test_datagrams_hold_the_description_and_then_each_message(heard: socket.sock
     about, first, second = (read(heard.recv(1 << 16)) for _ in range(3))
     publisher.close()
     assert about == {
-        **{"version": 1, "kind": "description", "channels": ["a", "b"], "steps": [1, 2]},
+        **{"version": 1, "kind": "description", "of": "forecast", "channels": ["a", "b"], "steps": [1, 2]},
         **{"unit": "count", "rate_hz": 50.0, "model": "models/forward"},
     }
     assert np.array_equal(np.array(first["values"], dtype=np.float32), VALUES) and first["seq"] == 1

@@ -179,15 +179,11 @@ def test_strength_counts_where_it_tells_the_class() -> None:
     assert np.mean(fitted.predict(new) == truth) > 0.8
 
 
-def test_shuffled_labels_are_learned_from_the_same_patterns_and_tell_nothing() -> None:
+def test_shuffled_labels_tell_nothing() -> None:
     x, labels = textured(60)
     new, truth = textured(300, seed=1)
     shuffled = np.random.default_rng(0).permutation(labels)
-    fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
-    relabelled = fitted.with_labels(x, shuffled)
-    assert np.mean(relabelled.predict(new) == truth) < 0.6
-    fitted_alone = MinirocketClassifier.fit(x, shuffled, features=PATTERNS)
-    assert np.array_equal(relabelled.scores(new), fitted_alone.scores(new))
+    assert np.mean(MinirocketClassifier.fit(x, shuffled, features=PATTERNS).predict(new) == truth) < 0.6
 
 
 def test_the_seed_decides_a_classifier_and_tensors_hold_it() -> None:

@@ -103,7 +103,7 @@ def errors(forecaster: Forecaster, shard: FakeShard, *, everywhere: bool = False
     parts = list(iterate_predictions(forecaster, track, chosen))
     return {
         name: np.concatenate(
-            [np.square(batch.predictions[name].count - batch.truth.count).mean(axis=2) for batch in parts]
+            [np.square(dict(batch.each_prediction())[name].count - batch.truth.count).mean(axis=2) for batch in parts]
         )
         for name in (MODEL, BASELINE)
     }
@@ -201,7 +201,7 @@ def watch(forecaster: Forecaster, shard: FakeShard) -> Watch:
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     ahead = np.full_like(track.tactile, np.nan)
     for batch in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-        ahead[batch.forecast.now] = batch.predictions[MODEL].count[:, -1]
+        ahead[batch.forecast.now] = dict(batch.each_prediction())[MODEL].count[:, -1]
     felt = pull_over_pressure(track.tactile[:])
     pull = np.hypot(floats(shard, "gt_force_x_n"), floats(shard, "gt_force_z_n"))
     pressure = floats(shard, "gt_finger1_normal_n") + floats(shard, "gt_finger2_normal_n")
@@ -267,7 +267,7 @@ def predicted_counts(forecaster: Forecaster, shard: FakeShard) -> tuple[Int64s, 
     """Return the rows at which predictions are made, and the predicted counts (window, step, channel)."""
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     parts = list(iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)))
-    counts = np.concatenate([batch.predictions[MODEL].count for batch in parts])
+    counts = np.concatenate([dict(batch.each_prediction())[MODEL].count for batch in parts])
     return np.concatenate([batch.forecast.now for batch in parts]), counts
 
 
@@ -310,7 +310,9 @@ def test_under_constant_load_nobody_beats_the_noise(tmp_path: Path) -> None:
         for batch in iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             for name, errors_of_name in squared.items():
                 errors_of_name.append(
-                    np.square(batch.predictions[name].count - batch.truth.count)[..., first_skin].mean(axis=2)
+                    np.square(dict(batch.each_prediction())[name].count - batch.truth.count)[..., first_skin].mean(
+                        axis=2
+                    )
                 )
     model, baseline = (np.concatenate(squared[name]).mean(axis=0) / noise for name in (MODEL, BASELINE))  # (step,)
     assert baseline == pytest.approx(2.0, rel=0.05)

@@ -46,7 +46,7 @@ class ClassifyTask(LearnedTask):
     states = "probabilities"
 
     @staticmethod
-    @stage(version=1)
+    @stage(version=2)
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that names a label from touch.
 

@@ -272,14 +272,15 @@ def _predictions(
         doing = situations.window_situations(track, now, forecaster.horizon)
         if not trial.seen:
             by_situation.count(trial.name, doing)
-        for name, prediction in windows.predictions.items():
-            trial.add_errors(name, prediction, windows.truth, forecaster.feature_half)
+        truth = windows.truth
+        for name, prediction in windows.each_prediction():
+            trial.add_errors(name, prediction, truth, forecaster.feature_half)
             if not trial.seen:
-                by_situation.add(trial.name, doing, name, prediction, windows.truth)
+                by_situation.add(trial.name, doing, name, prediction, truth)
         bands.add(track, trial, windows.forecast)
         stored = windows.forecast.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
         gathered.add(_prediction_table(forecaster, track, now, steps, np.ascontiguousarray(stored)))
-        del windows, stored  # frees the memory for the next windows
+        del windows, truth, stored  # frees the memory for the next windows
     return gathered.rows()
 
 

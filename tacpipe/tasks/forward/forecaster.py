@@ -26,6 +26,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.kinematics import make_continuous
+from tacpipe.tasks import task
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.networks import with_actions
 from tacpipe.tasks.forward.params import ForwardConfig, Params
@@ -33,7 +34,6 @@ from tacpipe.tasks.forward.quantiles import FILE as QUANTILES
 from tacpipe.tasks.forward.quantiles import ForecastQuantiles, window_features
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.recordings import OpenedChain
-from tacpipe.tasks.task import quantiles_of
 
 TASK = "forward"
 FAR = 0.95  # quantile over channels of the levels in a training row, whose maximum over rows is stored
@@ -237,7 +237,7 @@ class Forecaster:
         Arrays without the axis of windows are one window. Raises `TacpipeError` if shapes or values do not fit the
         model, or it lacks a quantile of ``percents``.
         """
-        at = self.quantiles_of(percents)[1] if percents else []
+        at = self.quantile_places(percents)
         single = np.ndim(window) == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
@@ -247,9 +247,9 @@ class Forecaster:
             predicted = self.forecast_quantiles(windows, touch[:, -self.context :], predicted)[..., at]
         return predicted[0] if single else predicted
 
-    def quantiles_of(self, percents: Sequence[int]) -> tuple[ForecastQuantiles, list[int]]:
-        """Return the quantiles, and the indices of ``percents`` among them; see `tacpipe.tasks.task.quantiles_of`."""
-        return quantiles_of(self.quantiles, percents)
+    def quantile_places(self, percents: Sequence[int]) -> list[int]:
+        """Return the places of ``percents`` among the quantiles; see `tacpipe.tasks.task.quantile_places`."""
+        return task.quantile_places(self.quantiles.percents if self.quantiles else (), percents)
 
     def error_features(self, windows: ForecastWindows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return the `window_features` of windows, from which the uncertainty of a forecast is computed.

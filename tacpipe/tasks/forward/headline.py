@@ -105,34 +105,6 @@ class PredictorScores(TypedDict):
     mse_feature: NotRequired[dict[str, float]]  # of latents scaled to ±1
 
 
-class LiveRows(TypedDict):
-    """Comparison of forecasts published in live sessions with the output of ``predict --causal``."""
-
-    published: int
-    recomputed: int
-    compared: int
-    equal: int
-    differ_after_late_samples: int
-    largest_difference: float
-    late_samples: int
-    skipped: int
-    of_errors: int
-
-
-class LiveMeasures(TypedDict):
-    """Measures of recorded live sessions."""
-
-    rows: LiveRows
-    mae: dict[str, dict[str, float]]  # by predictor and step
-    latency: dict[str, float]
-
-
-class LiveMetrics(LiveMeasures):
-    """Measures of all recorded live sessions together and of each session."""
-
-    recordings: dict[str, LiveMeasures]
-
-
 @dataclass(frozen=True)
 class ForwardScores:
     """Errors and skill on a set of recordings."""

@@ -94,12 +94,6 @@ class Trial:
     windows: int = 0
     errors: dict[str, ForecastErrorSums] = field(default_factory=dict)
 
-    def add(self, predictions: Mapping[str, Prediction], truth: Prediction, feature_half: AnyFloats) -> None:
-        """Add the errors of all predictors on some windows of the recording."""
-        self.windows += len(truth.count)
-        for name, predicted in predictions.items():
-            self.add_errors(name, predicted, truth, feature_half)
-
     def add_errors(self, name: str, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> None:
         """Add one predictor's errors on some windows. Does not change the number of windows."""
         errors = ForecastErrorSums.from_predictions(predicted, truth, feature_half)

@@ -58,7 +58,7 @@ def _collect_predictions(
     Raises the errors of `predict`.
     """
     check_steps(steps, forecaster.horizon)
-    level_indices = forecaster.quantiles_of(quantiles)[1] if quantiles else []
+    level_indices = forecaster.quantile_places(quantiles)
     check_codec(forecaster.codec_files, recordings.files)
     step_indices, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
     spill, gathered = Spill(KEPT_BYTES), {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import ItemsView, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,15 +48,6 @@ class WindowForecast:
         return self.past[:, -1]
 
 
-@dataclass(frozen=True)
-class Predicted:
-    """Some windows of a recording with the measured signals and each predictor's predictions."""
-
-    forecast: WindowForecast
-    truth: Prediction
-    predictions: Mapping[str, Prediction]  # `items` computes them one by one, so that not all are in memory at once
-
-
 def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[WindowForecast]:
     """Yield the model's predictions for the windows of ``track`` that start at ``starts``, in batches."""
     track = replace(track, arm=tracks.align_quaternions(track.arm, forecaster.orientation))
@@ -79,39 +70,22 @@ def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> WindowFor
     return WindowForecast(windows, past, future, features, count)
 
 
-def iterate_predictions(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
-    """Yield all predictors' predictions for the windows of ``track`` that start at ``starts``, in batches."""
-    for forecast in forecasts(forecaster, track, starts):
-        truth = Prediction(track.latent[forecast.future], track.tactile[forecast.future])
-        yield Predicted(forecast, truth, _Predictions(forecaster, track, forecast))
-        del forecast, truth  # frees the memory for the next windows
+@dataclass(frozen=True)
+class Predicted:
+    """Some windows of a recording with the measured signals and each predictor's predictions."""
 
+    forecaster: Forecaster
+    track: Track
+    forecast: WindowForecast
 
-class _Predictions(Mapping[str, Prediction]):
-    """Each predictor's predictions for some windows, computed at each access."""
-
-    def __init__(self, forecaster: Forecaster, track: Track, forecast: WindowForecast) -> None:
-        self._forecaster, self._track, self._forecast = forecaster, track, forecast
-
-    def items(self) -> ItemsView[str, Prediction]:
-        """Return pairs of names and predictions, computed during iteration."""
-        return _Items(self)
-
-    def __getitem__(self, name: str) -> Prediction:
-        for predictor, prediction in self.each_prediction():
-            if predictor == name:
-                return prediction
-        raise KeyError(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name, _ in self.each_prediction())
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
+    @property
+    def truth(self) -> Prediction:
+        """The measured signals."""
+        return Prediction(self.track.latent[self.forecast.future], self.track.tactile[self.forecast.future])
 
     def each_prediction(self) -> Iterator[tuple[str, Prediction]]:
-        """Yield each predictor's name and prediction."""
-        forecaster, track, forecast = self._forecaster, self._track, self._forecast
+        """Yield each predictor's name and prediction, computed one by one, so that not all are in memory at once."""
+        forecaster, track, forecast = self.forecaster, self.track, self.forecast
         yield from _model_predictions(forecaster, track, forecast)
         yield from _codec_predictions(forecaster, track, forecast)
         past = track.tactile[forecast.past]
@@ -122,15 +96,11 @@ class _Predictions(Mapping[str, Prediction]):
                 yield name, Prediction(None, counts)
 
 
-class _Items(ItemsView[str, Prediction]):
-    """Names and predictions of `_Predictions`, without a lookup of each name."""
-
-    def __init__(self, predictions: _Predictions) -> None:
-        super().__init__(predictions)
-        self._each_prediction = predictions.each_prediction
-
-    def __iter__(self) -> Iterator[tuple[str, Prediction]]:
-        return self._each_prediction()
+def iterate_predictions(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
+    """Yield all predictors' predictions for the windows of ``track`` that start at ``starts``, in batches."""
+    for forecast in forecasts(forecaster, track, starts):
+        yield Predicted(forecaster, track, forecast)
+        del forecast  # frees the memory for the next windows
 
 
 def _model_predictions(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, get_args
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats
-from tacpipe.models.boosting import BoostedTrees, TreeSizes
+from tacpipe.models.boosting import BINS, BoostedTrees, TreeSizes
 from tacpipe.models.forest import Forest
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.features import SMALLEST_DEVIATION, FeatureKind, Kind, standardise
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 ALPHAS = tuple(10.0**power for power in range(-3, 6))  # penalties of ridge regression for standardised features
 PENALTY = 0.01  # L2 penalty of logistic regression, relative to the mean error of an example
+MANY_FEATURES, FEW_BINS = 256, 63  # features above which boosted trees have so few bins, which takes half the time
 SMALLEST_PROBABILITY = 1e-4  # smallest probability of a class by trees
 
 
@@ -221,7 +222,8 @@ class FittedBoosting:
         """Return trees of least absolute error, or of one class against the others."""
         rows = examples.features(features)
         rows = np.where(np.isnan(rows).all(axis=0), 0.0, rows)  # scikit-learn bins no column without values
-        sizes = TreeSizes(trees, leaves, leaf, learning_rate, l2, seed)
+        bins = BINS if rows.shape[1] <= MANY_FEATURES else FEW_BINS
+        sizes = TreeSizes(trees, leaves, leaf, learning_rate, l2, seed, bins)
         if kind == "quantity":
             grown = [BoostedTrees.fit_values(rows, column, sizes) for column in outputs.T]
         else:

@@ -29,7 +29,7 @@ from tacpipe.tasks.learning.params import LearnedConfig, LearningParams
 from tacpipe.tasks.learning.training import read_examples
 from tacpipe.tasks.learning.uncertainty import ClassProbabilities, ErrorQuantiles, measure_uncertainty
 from tacpipe.tasks.recordings import OpenedChain, open_for_model
-from tacpipe.tasks.task import CalibrationRequest, Files, quantiles_of
+from tacpipe.tasks.task import CalibrationRequest, Files, quantile_places
 
 NEEDED: Mapping[str, model_files.Kind] = {
     "params": dict,
@@ -109,9 +109,9 @@ class LearnedModel:
         return next(iter(tables.values())) if isinstance(recordings, Recording) else tables
 
     def quantile_places(self, quantiles: Sequence[int]) -> list[int]:
-        """Return the places of quantiles in percent among those of the model. Raises `TacpipeError` for others."""
-        available = self.uncertainty if isinstance(self.uncertainty, ErrorQuantiles) else None
-        return quantiles_of(available, quantiles)[1] if quantiles else []
+        """Return the places of quantiles in percent among those of the model. Raises `UsageError` for others."""
+        available = self.uncertainty.percents if isinstance(self.uncertainty, ErrorQuantiles) else ()
+        return quantile_places(available, quantiles)
 
     def tables(self, recordings: Dataset, quantiles: Sequence[int] = ()) -> dict[str, pa.Table]:
         """Return the predictions of each recording."""

@@ -82,13 +82,12 @@ class AutoEstimator(EstimatorParams):
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
         """Return the candidates with their default sizes."""
         from tacpipe.tasks.learning.estimators import FittedBoosting, FittedLinear, FittedTrees
+        from tacpipe.tasks.learning.selection import fit_with
 
         return {
-            "linear": lambda examples, outputs, part: FittedLinear.fit(examples, outputs, self.KIND),
-            "trees": lambda examples, outputs, part: FittedTrees.fit(examples, outputs, self.KIND, seed=self.seed),
-            "boosting": lambda examples, outputs, part: FittedBoosting.fit(
-                examples, outputs, self.KIND, seed=self.seed
-            ),
+            "linear": fit_with(FittedLinear, self.KIND),
+            "trees": fit_with(FittedTrees, self.KIND, seed=self.seed),
+            "boosting": fit_with(FittedBoosting, self.KIND, seed=self.seed),
         }
 
 
@@ -98,8 +97,9 @@ class LinearEstimator(EstimatorParams):
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
         """Return the regression."""
         from tacpipe.tasks.learning.estimators import FittedLinear
+        from tacpipe.tasks.learning.selection import fit_with
 
-        return {"linear": lambda examples, outputs, part: FittedLinear.fit(examples, outputs, self.KIND)}
+        return {"linear": fit_with(FittedLinear, self.KIND)}
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,9 @@ class TreesEstimator(EstimatorParams):
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
         """Return the trees."""
         from tacpipe.tasks.learning.estimators import FittedTrees
+        from tacpipe.tasks.learning.selection import fit_with
 
-        return {
-            "trees": lambda examples, outputs, part: FittedTrees.fit(
-                examples, outputs, self.KIND, trees=self.trees, leaf=self.leaf, seed=self.seed
-            )
-        }
+        return {"trees": fit_with(FittedTrees, self.KIND, trees=self.trees, leaf=self.leaf, seed=self.seed)}
 
 
 @dataclass(frozen=True)
@@ -133,20 +130,11 @@ class BoostingEstimator(EstimatorParams):
     def candidates(self, workspace: Path) -> Mapping[str, Fit]:
         """Return the trees."""
         from tacpipe.tasks.learning.estimators import FittedBoosting
+        from tacpipe.tasks.learning.selection import fit_with
 
-        return {
-            "boosting": lambda examples, outputs, part: FittedBoosting.fit(
-                examples,
-                outputs,
-                self.KIND,
-                trees=self.trees,
-                leaves=self.leaves,
-                leaf=self.leaf,
-                learning_rate=self.learning_rate,
-                l2=self.l2,
-                seed=self.seed,
-            )
-        }
+        names = ("trees", "leaves", "leaf", "learning_rate", "l2", "seed")
+        options = {name: getattr(self, name) for name in names}
+        return {"boosting": fit_with(FittedBoosting, self.KIND, **options)}
 
 
 @dataclass(frozen=True)

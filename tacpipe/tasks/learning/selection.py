@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from tacpipe.printable import round_to
 from tacpipe.tasks.learning.answers import ModelAnswers
 from tacpipe.tasks.learning.estimators import OutputEstimator
 from tacpipe.tasks.learning.examples import Examples
+from tacpipe.tasks.learning.features import Kind
 
 FOLDS = 5
 FRACTIONS = (0.125, 0.25, 0.5, 1.0)  # fractions of the training groups of a learning curve
@@ -57,6 +58,11 @@ class Selection:
     def outputs(self) -> Floats:
         """The outputs of the chosen candidate (example, output)."""
         return self.predicted[self.name]
+
+
+def fit_with(estimator: Any, kind: Kind, **options: Any) -> Fit:
+    """Return a function that fits an estimator, a class of `estimators`, with these options."""
+    return lambda examples, outputs, part: estimator.fit(examples, outputs, kind, **options)
 
 
 def assign_folds(examples: Examples, seed: int) -> Indices:

@@ -14,6 +14,7 @@ from tacpipe.codecs import tactile
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW
 from tacpipe.printable import listed
 from tacpipe.tasks import recordings as recordings_of
@@ -24,7 +25,7 @@ from tacpipe.tasks.learning.estimators import FittedConstant, FittedLinear, Fitt
 from tacpipe.tasks.learning.examples import Examples
 from tacpipe.tasks.learning.inputs import InputRows, Inputs, RawStream, find_inputs
 from tacpipe.tasks.learning.params import LearningParams
-from tacpipe.tasks.learning.selection import Fit
+from tacpipe.tasks.learning.selection import Fit, fit_with
 from tacpipe.tasks.learning.uncertainty import measure_uncertainty
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def train(
     )
     rows = [inputs.place(training.recordings[name], streams) for name, streams in raw.items()]
     rows = examples_of.recentre(rows, params.recentre) if params.recentre else rows
-    group = [label.strip() for label in params.group.split(",") if label.strip()]
+    group = CommaList().items(params.group)
     whole = of_recordings and params.context_s is None
     examples = read_examples(inputs, rows, answers, group, params.stride, whole=whole)
     thinned = (
@@ -130,7 +131,7 @@ def input_columns(schema: pa.Schema, params: LearningParams, answers: ModelAnswe
     targets = set(answers.value_names)
     owners = {name: field_metadata(schema.field(name)).get("stream", "") for name in schema.names}
     own_streams = {owner for name, owner in owners.items() if name in targets and owner}
-    patterns = [word.strip() for word in params.inputs.split(",") if word.strip()]
+    patterns = CommaList().items(params.inputs)
     wanted = set(tactile.columns(schema, "tactile"))
     if patterns:
         wanted = {name for name in schema.names if any(fnmatchcase(name, pattern) for pattern in patterns)}
@@ -189,14 +190,11 @@ def _require_learnable(answers: ModelAnswers, examples: Examples) -> ModelAnswer
 
 def _baseline_fits(params: LearningParams, examples: Examples, *, grouped: bool) -> dict[str, Fit]:
     """Return the baselines that apply: constant, mean of the group, last row, and the time since the start alone."""
-    kind = params.KIND
-    fits: dict[str, Fit] = {"constant": lambda part, outputs, name: FittedConstant.fit(part, outputs, kind)}
+    fits = {"constant": fit_with(FittedConstant, params.KIND)}
     if grouped:
-        fits["group_mean"] = lambda part, outputs, name: FittedConstant.fit(part, outputs, kind, by_group=True)
+        fits["group_mean"] = fit_with(FittedConstant, params.KIND, by_group=True)
     if np.ptp(examples.since_s) > 0:
-        fits["time_alone"] = lambda part, outputs, name: FittedTrees.fit(
-            part, outputs, kind, features="time", leaf=TIME_LEAF, seed=params.seed
-        )
+        fits["time_alone"] = fit_with(FittedTrees, params.KIND, features="time", leaf=TIME_LEAF, seed=params.seed)
     if any(stream.rows > 1 for stream in examples.inputs.streams):
-        fits["last_row"] = lambda part, outputs, name: FittedLinear.fit(part, outputs, kind, features="last")
+        fits["last_row"] = fit_with(FittedLinear, params.KIND, features="last")
     return fits

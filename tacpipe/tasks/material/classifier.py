@@ -24,12 +24,11 @@ from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.scores import calibration
-from tacpipe.tasks.material import estimators
+from tacpipe.tasks.material import networks
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.estimators import FittedEstimator
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.losses import CHUNK, Network
-from tacpipe.tasks.material.params import MEAN_LEVEL, Estimator, MaterialConfig, NetworkParams, Params
+from tacpipe.tasks.material.params import MEAN_LEVEL, MaterialConfig, NetworkParams, Params
 from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import SlideLayout, Slides, describe_difference
 from tacpipe.tasks.recordings import OpenedChain
@@ -44,11 +43,10 @@ NEEDED = {
     "architecture": str,
 }
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
-ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
 UNKNOWN_ANSWER = "unknown"
 
 ReadoutModel = MinirocketClassifier | StatisticsClassifier
-Baseline = Level | ReadoutModel | FittedEstimator
+Baseline = Level | ReadoutModel
 
 
 @dataclass(frozen=True)
@@ -155,18 +153,6 @@ class SpectraReader(Reader):
     def scores_by(self, partner: Reader, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes learned from other sensors only."""
         return expand_scores(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
-
-
-@dataclass(frozen=True)
-class EstimatorReader(Reader):
-    """Estimator of one sensor."""
-
-    fitted: FittedEstimator
-    classes: tuple[int, ...]
-
-    def read(self, frames: Float32s) -> ReaderOutput:
-        """Return the estimator's scores of slides (slide, time, channel) in device counts."""
-        return ReaderOutput(expand_scores(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
 class Classifier:
@@ -405,30 +391,15 @@ class StoredClassifier:
         for name in self.layouts:
             shape = AutoencoderShape(**self.config["shapes"][name])
             weights = tensors_under(f"{name}.", tensors)
-            network = model_files.build_with_weights(
-                functools.partial(estimators.build_network, params, shape), weights
-            )
+            network = model_files.build_with_weights(functools.partial(networks.build_network, params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
-
-    def estimators(self, params: Estimator) -> dict[str, Reader]:
-        """Return the fitted estimators by sensor."""
-        fitted = self._estimators(params, ESTIMATORS)
-        return {name: EstimatorReader(estimator, self.classes) for name, estimator in fitted.items()}
-
-    def shuffled_estimators(self, params: Estimator) -> dict[str, Baseline]:
-        """Return the estimators fitted to shuffled labels by sensor."""
-        return {**self._estimators(params, SHUFFLED_ESTIMATORS)}
 
     def baseline(self, name: str, kind: type[Level | ReadoutModel]) -> dict[str, Baseline]:
         """Return a stored baseline by sensor."""
         arrays = model_files.arrays(self.files[BASELINES], BASELINES, but=CHOSEN)
         return {sensor: kind.from_tensors(tensors_under(f"{name}.{sensor}.", arrays)) for sensor in self.layouts}
-
-    def _estimators(self, params: Estimator, file: str) -> dict[str, FittedEstimator]:
-        fitted = estimators.unpack_estimators(self.files[file], file, params)
-        return {name: fitted[name] for name in self.layouts}
 
 
 def expand_scores(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,8 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
 from tacpipe.printable import listed
 from tacpipe.tasks import recordings
-from tacpipe.tasks.material import estimators, readouts
+from tacpipe.tasks.material import networks as networks_of
+from tacpipe.tasks.material import readouts
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import (
     BASELINES,
@@ -39,13 +41,10 @@ from tacpipe.tasks.material.params import (
     MEAN_LEVEL,
     PERMUTED_LABELS,
     BestEpochs,
-    Estimator,
     MaterialConfig,
-    Minirocket,
     Params,
+    ReadoutParams,
     Spectra,
-    Statistics,
-    StoredShape,
     aligning_architectures,
 )
 from tacpipe.tasks.material.params import NetworkParams as NetworkParams
@@ -107,7 +106,8 @@ def train_network(
         }
         for part in (training_slides, validation_slides)
     )
-    partners = _partners(params, len(config["classes"]))
+    classes = range(len(config["classes"]))
+    partners = permuted_classes(classes, params.seed) if params.pairing_method == "permuted" else None
     _add_networks(config, shapes, scalings, held_out_materials, partners)
     config["joint"] = joint
     pairs = _pairs(params, training, partners)
@@ -116,7 +116,7 @@ def train_network(
     def build() -> nn.Module:
         networks = _build_networks(params, shapes, frozen, mapped_to).to(device)
         for name, network in networks.items():
-            estimators.check_network(network, params, training[name].frames, shapes[name].classes)
+            networks_of.check_network(network, params, training[name].frames, shapes[name].classes)
         return networks
 
     trained = loop.train(build, work, loop.Schedule.from_params(params, params.seed), workspace)
@@ -127,27 +127,6 @@ def train_network(
     return files
 
 
-def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
-    """Return each class's partner across sensors for permuted pairs; None for other pairs."""
-    if params.pairing_method == "permuted":
-        return permuted_classes(range(classes), params.seed)
-    return None
-
-
-def _shape_json(shape: AutoencoderShape) -> StoredShape:
-    """Return the JSON value of a network's shape."""
-    return {
-        "channels": shape.channels,
-        "classes": shape.classes,
-        "header": shape.header,
-        "decoder": shape.decoder,
-        "hidden": shape.hidden,
-        "latents": shape.latents,
-        "unpool": shape.unpool,
-        "dropout": shape.dropout,
-    }
-
-
 def _add_networks(
     config: MaterialConfig,
     shapes: Mapping[str, AutoencoderShape],
@@ -156,7 +135,7 @@ def _add_networks(
     partners: Mapping[int, int] | None,
 ) -> None:
     """Add the shapes, scalings, held-out materials and partner classes of the networks to ``config``."""
-    config["shapes"] = {name: _shape_json(shape) for name, shape in shapes.items()}
+    config["shapes"] = {name: dataclasses.asdict(shape) for name, shape in shapes.items()}
     config["scaling"] = {
         name: {key: value.tolist() for key, value in scaling.to_tensors().items()} for name, scaling in scalings.items()
     }
@@ -258,7 +237,7 @@ def _build_networks(
 ) -> nn.ModuleDict:
     """Return the networks by sensor; ``frozen`` is copied to its sensor and frozen, and all others use its classifier."""
     networks = nn.ModuleDict(
-        {name: cast(nn.Module, estimators.build_network(params, shape)) for name, shape in shapes.items()}
+        {name: cast(nn.Module, networks_of.build_network(params, shape)) for name, shape in shapes.items()}
     )
     if frozen:
         for name, network in networks.items():
@@ -294,7 +273,7 @@ def _network_baselines(trained: Classifier, training_slides: BySensor, params: P
     for index, (name, slides) in enumerate(training_slides.items()):
         latents = trained.readers[name].read(slides.frames).latents
         assert latents is not None
-        shuffled = np.random.default_rng([params.seed, 3, index]).permutation(slides.materials)
+        shuffled = readouts.shuffled_labels(params, slides.materials, index)
         arrays |= readouts.baseline_tensors(MEAN_LEVEL, name, Level.fit(slides.frames, slides.materials))
         arrays |= readouts.baseline_tensors(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
     return readouts.pack(arrays)
@@ -311,22 +290,14 @@ class TrainingSlides:
     workspace: Path  # folder for checkpoints, so that training can resume
     init: Mapping[str, bytes] | None  # files of the ``--init`` model
 
-    def fit_rockets(self, params: Minirocket) -> dict[str, bytes]:
-        """Return the files of random convolutions and a readout for each sensor."""
-        return readouts.fit_rockets(params, self.config, self.training, self.validation)
-
-    def fit_statistics(self, params: Statistics) -> dict[str, bytes]:
-        """Return the files of statistics and a readout for each sensor."""
-        return readouts.fit_statistics(params, self.config, self.training, self.validation)
+    def fit_readouts(self, params: ReadoutParams) -> dict[str, bytes]:
+        """Return the files of features and a readout for each sensor."""
+        return readouts.fit_readouts(params, self.config, self.training, self.validation)
 
     def fit_spectra(self, params: Spectra) -> dict[str, bytes]:
         """Return the files of spectra, through which sensors learn materials from each other."""
         excluded = slides_of.held_out_materials(params.hold_out, self.config["classes"], self.training, self.naming)
         return readouts.fit_spectra(params, self.config, self.training, self.validation, excluded)
-
-    def fit_estimators(self, params: Estimator) -> dict[str, bytes]:
-        """Return the files of one fitted estimator of scikit-learn per sensor."""
-        return readouts.fit_estimators(params, self.config, self.training, self.validation)
 
     def train_networks(self, params: NetworkParams) -> dict[str, bytes]:
         """Return the files of one network per sensor, trained by the shared loop."""
@@ -348,7 +319,7 @@ def train(
     """
     _check_init(params, init)
     only = CommaList().items(params.sensors)
-    kinds = slides_of.quantities(params.quantities) or params.QUANTITIES
+    kinds = tuple(CommaList().items(params.quantities)) or params.QUANTITIES
     naming = _label_naming(params.label, training, validation)
     training_slides = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
     validation_slides: BySensor = {}

@@ -1,6 +1,6 @@
 """Params of `tacpipe train material`, which define how a classifier is built and trained; one class per architecture.
 
-Classes of other packages extend `Estimator` or `NetworkParams`, whose methods define a classifier's inputs and outputs.
+Classes of other packages extend `NetworkParams`, whose method `build` defines the inputs and outputs of a network.
 """
 
 from __future__ import annotations
@@ -35,15 +35,12 @@ from tacpipe.training.devices import Precision
 if TYPE_CHECKING:
     from torch import nn
 
-    from tacpipe.arrays import Float32s
-    from tacpipe.models.readout import View
     from tacpipe.models.recurrent_autoencoder import AutoencoderShape
-    from tacpipe.tasks.material.classifier import Baseline, Reader, StoredClassifier
+    from tacpipe.tasks.material.classifier import Baseline, Reader, ReadoutModel, StoredClassifier
     from tacpipe.tasks.material.losses import Weights
     from tacpipe.tasks.material.network_training import TrainingSlides
 
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"  # baselines of all architectures
-LEVEL_VIEWS: Mapping[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # baselines of statistics
 KEY = "material"  # default label key of classes
 # from the paper's text; its code has no header for BioTac, and PyTorch ignores its dropout in a single-layer LSTM
 _PAPER_TEXT: Mapping[str, Scalar] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
@@ -59,7 +56,6 @@ class MaterialModelParams(ABC):
     TITLE: ClassVar[str] = ""  # name in reports; empty: the architecture
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # default of the param ``quantities``
     ALIGNS_SENSORS: ClassVar[bool] = False  # True if networks can be aligned to the frozen one of the --init model
-    IS_READOUT: ClassVar[bool] = False  # True for one linear readout per sensor, fitted in closed form
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to train on; empty: all
     # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings per frame)
@@ -98,7 +94,7 @@ class MaterialModelParams(ABC):
     def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
         """Return the files of a model trained on ``slides``: ``config.json`` and the classifier's parameters.
 
-        `Estimator` and `NetworkParams` implement it for the estimators and networks that an architecture builds.
+        `NetworkParams` implements it for the networks that an architecture builds.
         """
 
     @property
@@ -107,7 +103,7 @@ class MaterialModelParams(ABC):
         return 0
 
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return the fitted reader of each sensor. `Estimator` and `NetworkParams` implement it.
+        """Return the fitted reader of each sensor. `NetworkParams` implements it.
 
         Raises `TacpipeError` if the architecture lacks it.
         """
@@ -121,61 +117,73 @@ class MaterialModelParams(ABC):
 
 
 @dataclass(frozen=True)
-class Minirocket(MaterialModelParams):
+class ReadoutParams(MaterialModelParams, ABC):
+    """A linear readout of features per sensor, fitted in closed form."""
+
+    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
+    VIEWS: ClassVar[Mapping[str, str]] = {}  # further baselines, and the part of slides that they read
+    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
+
+    @property
+    @abstractmethod
+    def model(self) -> type[ReadoutModel]:
+        """The class of the classifier."""
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The settings of its ``fit``."""
+        return {}
+
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of features and a readout for each sensor."""
+        return slides.fit_readouts(self)
+
+    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
+        """Return features and a readout by sensor."""
+        return stored.readouts(self.model)
+
+    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
+        """Return the same model fitted to shuffled labels, and to the `VIEWS` of slides."""
+        return {name: stored.baseline(name, self.model) for name in (PERMUTED_LABELS, *self.VIEWS)}
+
+
+@dataclass(frozen=True)
+class Minirocket(ReadoutParams):
     """Random convolutions and a linear readout per sensor: our most accurate classifier."""
 
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
     TITLE: ClassVar[str] = "MiniRocket"
-    IS_READOUT: ClassVar[bool] = True
-    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     features: Annotated[int, Range(84)] = 10_000  # features of each sensor
-    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
     PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
 
-    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
-        """Return the files of random convolutions and a readout for each sensor."""
-        return slides.fit_rockets(self)
-
-    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return random convolutions and a readout by sensor."""
+    @property
+    def model(self) -> type[ReadoutModel]:
+        """The class of the classifier."""
         from tacpipe.models.minirocket import MinirocketClassifier
 
-        return stored.readouts(MinirocketClassifier)
+        return MinirocketClassifier
 
-    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return the same model fitted to shuffled labels."""
-        from tacpipe.models.minirocket import MinirocketClassifier
-
-        return {PERMUTED_LABELS: stored.baseline(PERMUTED_LABELS, MinirocketClassifier)}
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Random seed and number of the patterns."""
+        return {"seed": self.seed, "features": self.features}
 
 
 @dataclass(frozen=True)
-class Statistics(MaterialModelParams):
+class Statistics(ReadoutParams):
     """Statistics of each channel and a linear readout per sensor, for sensors with few slides."""
 
     # statistics: statistics of each channel and a linear readout, for few slides
     architecture: Literal["statistics"] = "statistics"
-    IS_READOUT: ClassVar[bool] = True
-    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
-    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
+    VIEWS: ClassVar[Mapping[str, str]] = {"level_only": "level", "level_removed": "level_removed"}
 
-    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
-        """Return the files of statistics and a readout for each sensor."""
-        return slides.fit_statistics(self)
-
-    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return statistics and a readout by sensor."""
+    @property
+    def model(self) -> type[ReadoutModel]:
+        """The class of the classifier."""
         from tacpipe.models.readout import StatisticsClassifier
 
-        return stored.readouts(StatisticsClassifier)
-
-    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return the same model fitted to shuffled labels, to the level only, and to slides without their level."""
-        from tacpipe.models.readout import StatisticsClassifier
-
-        names = (PERMUTED_LABELS, *LEVEL_VIEWS)
-        return {name: stored.baseline(name, StatisticsClassifier) for name in names}
+        return StatisticsClassifier
 
 
 @dataclass(frozen=True)
@@ -197,47 +205,6 @@ class Spectra(MaterialModelParams):
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
         """Return spectra by sensor."""
         return stored.spectra()
-
-
-@dataclass(frozen=True)
-class Estimator(MaterialModelParams, ABC):
-    """A scikit-learn estimator per sensor on features of a slide; base class for architectures."""
-
-    use_validation: bool = True  # also train on validation slides; nothing is chosen by them
-    # types, such as sklearn.tree._tree.Tree, that a stored estimator may contain although skops does not validate them
-    TRUSTED: ClassVar[Sequence[str]] = ()
-
-    def features(self, frames: Float32s) -> Float32s:
-        """Return finite features (slide, feature) of slides (slide, time, channel) in device counts.
-
-        By default these are all frames: (slide, time · channel).
-        """
-        return frames.reshape(len(frames), -1)
-
-    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
-        """Return the files of one fitted estimator per sensor."""
-        return slides.fit_estimators(self)
-
-    def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
-        """Return the fitted estimators by sensor."""
-        return stored.estimators(self)
-
-    def read_baselines(self, stored: StoredClassifier) -> dict[str, dict[str, Baseline]]:
-        """Return estimators fitted to shuffled labels."""
-        return {PERMUTED_LABELS: stored.shuffled_estimators(self)}
-
-    @abstractmethod
-    def build(self, seed: int) -> Any:
-        """Return an unfitted estimator: a scikit-learn classifier, or a pipeline that ends with one.
-
-        It has ``fit(features, classes)`` with features (slide, feature), float32, and material numbers (slide,), int64;
-        and ``predict_proba`` or ``decision_function``, which return a score of each class (slide, class), highest for
-        the predicted class. ``seed`` is for its ``random_state``.
-
-        The task reads slides, splits them by role, fits one estimator per sensor on training slides (with
-        ``use_validation`` also on validation slides), fits the baselines and permuted labels, stores them without
-        pickle (skops: validated types, types of the architecture's package, and `TRUSTED`), and evaluates.
-        """
 
 
 @dataclass(frozen=True)
@@ -456,11 +423,6 @@ class XLSTM(NetworkParams):
 Params = MaterialModelParams  # params of any architecture
 
 
-def kind_of(architecture: str) -> type[Params]:
-    """Return the class of an architecture, or of all architectures if its package is not installed."""
-    return architectures.find(Params, architecture) or Params
-
-
 class StoredNaming(TypedDict):
     """Naming of classes in a model's configuration; empty for whole numbers under the default key."""
 
@@ -475,19 +437,6 @@ class StoredLayout(TypedDict):
     frames: int
     rate_hz: float
     layout: str
-
-
-class StoredShape(TypedDict):
-    """The fields of `AutoencoderShape`, in a model's configuration."""
-
-    channels: int
-    classes: int
-    header: str
-    decoder: str
-    hidden: int
-    latents: int
-    unpool: str
-    dropout: float
 
 
 class BestEpochs(TypedDict):
@@ -526,7 +475,7 @@ class MaterialConfig(ModelConfig, StoredNaming):
     classes: list[int]
     absent: NotRequired[list[str]]  # quantities that no sensor has
     counts: dict[str, dict[str, int]]  # role -> sensor -> number of slides
-    shapes: NotRequired[dict[str, StoredShape]]  # networks only
+    shapes: NotRequired[dict[str, dict[str, Any]]]  # networks only: the fields of `AutoencoderShape`
     scaling: NotRequired[dict[str, dict[str, list[float]]]]
     joint: NotRequired[bool]
     held_out: NotRequired[dict[str, list[int]]]  # sensor -> classes whose labels it does not learn

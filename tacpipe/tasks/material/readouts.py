@@ -1,8 +1,8 @@
-"""Fit models without epochs: convolutional features, statistics or spectra with a readout, and estimators."""
+"""Fit models without epochs: convolutional features, statistics or spectra with a readout."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from safetensors.numpy import save
@@ -10,92 +10,44 @@ from safetensors.numpy import save
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
-from tacpipe.models.minirocket import MinirocketClassifier
-from tacpipe.models.readout import Level, StatisticsClassifier
+from tacpipe.models.readout import Level
 from tacpipe.models.transfer import Bands, Sampling, Transfer
 from tacpipe.plugins.constraints import Assignments
-from tacpipe.tasks.material.classifier import (
-    BASELINES,
-    CONFIG,
-    ESTIMATORS,
-    SHUFFLED_ESTIMATORS,
-    WEIGHTS,
-    ReadoutModel,
-)
-from tacpipe.tasks.material.estimators import FittedEstimator, pack_estimators
+from tacpipe.tasks.material.classifier import BASELINES, CONFIG, WEIGHTS, ReadoutModel
 from tacpipe.tasks.material.headline import Naming
 from tacpipe.tasks.material.params import (
-    LEVEL_VIEWS,
     MEAN_LEVEL,
     PERMUTED_LABELS,
-    Estimator,
     MaterialConfig,
-    Minirocket,
     Params,
+    ReadoutParams,
     Spectra,
-    Statistics,
 )
 from tacpipe.tasks.material.slides import BySensor, Slides
 
 Arrays = dict[str, np.ndarray]
 
 
-def fit_rockets(
-    params: Minirocket, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
+def fit_readouts(
+    params: ReadoutParams, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
 ) -> dict[str, bytes]:
-    """Return the files of random convolutions and a readout per sensor. Raises the errors of the classifier's ``fit``."""
-    tensors: Arrays = {}
-    baselines: Arrays = {}
-    for index, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
-        strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
-        tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
-        if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
-            baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= baseline_tensors(PERMUTED_LABELS, name, strong.with_labels(frames, shuffled))
-    return _files(config, tensors, baselines)
+    """Return the files of features and a readout per sensor. Raises the errors of the classifier's ``fit``.
 
-
-def fit_estimators(
-    params: Estimator, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
-) -> dict[str, bytes]:
-    """Return the files of one scikit-learn estimator per sensor."""
-    fitted: dict[str, FittedEstimator] = {}
-    shuffled: dict[str, FittedEstimator] = {}
-    levels: Arrays = {}
-    for index, (name, slides) in enumerate(training_slides.items()):
-        frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
-        fitted[name] = FittedEstimator.fit(params, frames, materials)
-        if params.baselines:
-            permutation = np.random.default_rng([params.seed, 3, index]).permutation(materials)
-            levels |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
-            shuffled[name] = FittedEstimator.fit(params, frames, permutation)
-    files = {CONFIG: model_files.to_json(config), ESTIMATORS: pack_estimators(fitted, params)}
-    if params.baselines:
-        files |= {BASELINES: pack(levels), SHUFFLED_ESTIMATORS: pack_estimators(shuffled, params)}
-    return files
-
-
-def fit_statistics(
-    params: Statistics, config: MaterialConfig, training_slides: BySensor, validation_slides: BySensor
-) -> dict[str, bytes]:
-    """Return the files of channel statistics and a readout per sensor.
-
-    In addition to the common baselines, the same readout is fitted to the level only and to slides without their level.
+    Beside the mean level, the baselines are the same readout of shuffled labels, and of the views of ``params``.
     """
     tensors: Arrays = {}
     baselines: Arrays = {}
+    fit: Callable[..., ReadoutModel] = params.model.fit
     for index, (name, slides) in enumerate(training_slides.items()):
         frames, materials = _training_arrays(params, slides, validation_slides.get(name), index)
-        fitted = StatisticsClassifier.fit(frames, materials)
+        fitted = fit(frames, materials, **params.settings)
         tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
         if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
+            shuffled = fit(frames, shuffled_labels(params, materials, index), **params.settings)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
-            baselines |= baseline_tensors(PERMUTED_LABELS, name, StatisticsClassifier.fit(frames, shuffled))
-            for kind, view in LEVEL_VIEWS.items():
-                baselines |= baseline_tensors(kind, name, StatisticsClassifier.fit(frames, materials, view=view))
+            baselines |= baseline_tensors(PERMUTED_LABELS, name, shuffled)
+            for kind, view in params.VIEWS.items():
+                baselines |= baseline_tensors(kind, name, fit(frames, materials, view=view))
     return _files(config, tensors, baselines)
 
 
@@ -123,7 +75,7 @@ def fit_spectra(
         spectra = bands.log_power(frames, samplings[name].rate_hz, samplings[name].speed_m_s)
         labelled[name] = transfer.Labelled(spectra, materials)
         if params.baselines:
-            shuffled = np.random.default_rng([params.seed, 3, index]).permutation(materials)
+            shuffled = shuffled_labels(params, materials, index)
             baselines |= baseline_tensors(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= baseline_tensors(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
     learned = {name: {int(number) for number in sensor_labels.labels} for name, sensor_labels in labelled.items()}
@@ -172,7 +124,7 @@ def _samplings(speeds: str, training_slides: BySensor) -> dict[str, Sampling]:
 
 
 def _training_arrays(
-    params: Minirocket | Statistics | Spectra | Estimator,
+    params: ReadoutParams | Spectra,
     training_slides: Slides,
     validation_slides: Slides | None,
     index: int,
@@ -193,6 +145,11 @@ def permute_labels(params: Params, materials: np.ndarray, index: int) -> np.ndar
     if params.labels == "true":
         return materials
     return np.random.default_rng([params.seed, 2, index]).permutation(materials)
+
+
+def shuffled_labels(params: Params, materials: np.ndarray, index: int) -> np.ndarray:
+    """Return the labels of a sensor's slides in random order, for the baseline that learned nothing."""
+    return np.random.default_rng([params.seed, 3, index]).permutation(materials)
 
 
 def baseline_tensors(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:

@@ -251,15 +251,6 @@ def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
         ) from error
 
 
-def quantities(text: str) -> tuple[str, ...]:
-    """Return the quantities in a comma-separated list.
-
-    >>> quantities("tactile, vibration")
-    ('tactile', 'vibration')
-    """
-    return tuple(part.strip() for part in text.split(",") if part.strip())
-
-
 def held_out_materials(
     assignments: str, classes: Sequence[int], sensors: Iterable[str], naming: Naming = NUMBERS
 ) -> dict[str, set[int]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.learning.task import LearnedTask
@@ -54,7 +55,7 @@ class RegressTask(LearnedTask):
     states = "quantiles"
 
     @staticmethod
-    @stage(version=1)
+    @stage(version=2)
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that estimates quantities from touch.
 
@@ -67,8 +68,7 @@ class RegressTask(LearnedTask):
         from tacpipe.tasks.learning import training
         from tacpipe.tasks.learning.answers import Quantities
 
-        patterns = [word.strip() for word in params.target.split(",") if word.strip()]
-        answers = Quantities.find(train, patterns, params.horizon_s)
+        answers = Quantities.find(train, CommaList().items(params.target), params.horizon_s)
         files, notes = training.train("regress", params, answers, train, workspace)
         return Result(files=files, notes=notes)
 

@@ -43,8 +43,7 @@ def evaluate(files: Mapping[str, bytes], recordings: Dataset) -> Result:
     scores = {MODEL: model.scores(examples), **{name: scores_of(values) for name, values in outputs.items()}}
     probabilities = {name: 1 / (1 + np.exp(-values)) for name, values in scores.items()}
     probabilities[MODEL] = model.calibration.probability(scores[MODEL])
-    levels = {MODEL: model.calibration.levels, **model.config["baseline_levels"]}
-    evaluated = EvaluatedSlips.from_examples(examples, scores, probabilities, levels)
+    evaluated = EvaluatedSlips.from_examples(examples, scores, probabilities, model.calibration.levels)
     architecture = str(model.config["architecture"])
     origin = combine_origins(recordings.recordings[track.name].attributes for track in evaluated.tracks)
     return Result(
@@ -66,8 +65,7 @@ class EvaluatedSlips:
     tracks: tuple[ScoredTrack, ...]  # with the scores of the model
     scores: Mapping[str, tuple[Floats, ...]]  # predictor -> recording -> (row,)
     probabilities: Mapping[str, tuple[Floats, ...]]
-    # recording -> predictor -> false alarms per minute -> level
-    levels: Mapping[str, Mapping[str, Mapping[str, float]]]
+    levels: Mapping[str, Mapping[str, float]]  # recording -> false alarms per minute -> level of the model's alarm
     known_objects: frozenset[str] = frozenset()  # objects of the recordings that the model was trained on
     folds: tuple[
         int, ...
@@ -79,7 +77,7 @@ class EvaluatedSlips:
         examples: Examples,
         scores: Mapping[str, Floats],
         probabilities: Mapping[str, Floats],
-        levels: Mapping[str, Mapping[str, float]],
+        levels: Mapping[str, float],
     ) -> EvaluatedSlips:
         """Return the evaluation of windows, by the scores and probabilities (window,) of each predictor."""
         tracks = tuple(scored_tracks(examples, scores[MODEL]))
@@ -151,7 +149,6 @@ class EvaluatedSlips:
                 "auc": {part: metrics.to_json(table.score(name)) for part, table in tables.items()},
                 "brier": rounded(metrics.brier(probabilities, windows.states > STABLE, windows.weights)),
                 "accuracy": metrics.accuracy(probabilities, windows),
-                "alarms": self.alarms(name, horizon_ns),
             }
             if name != MODEL:
                 by_predictor[name]["margin"] = metrics.to_json(tables["before"].gain_over(name))
@@ -162,17 +159,16 @@ class EvaluatedSlips:
             "windows": len(windows.scores),
             "before": int((windows.states > STABLE).sum()),
         }
+        by_predictor[MODEL]["alarms"] = self.alarms(horizon_ns)
         return {**by_predictor, "counts": counts, "parts": metrics.PARTS}
 
-    def alarms(self, predictor: str, horizon_ns: int) -> dict[str, metrics.SlipAlarmScore]:
-        """Return the score of a predictor's alarm for each rate of false alarms; empty for a constant."""
-        tracks = self.scored_by(predictor)
-        rates = next(iter(self.levels.values())).get(predictor, {})
+    def alarms(self, horizon_ns: int) -> dict[str, metrics.SlipAlarmScore]:
+        """Return the score of the model's alarm for each rate of false alarms."""
         return {
             rate: metrics.score_alarm(
-                tracks, {track.name: self.levels[track.name][predictor][rate] for track in tracks}, horizon_ns
+                self.tracks, {name: levels[rate] for name, levels in self.levels.items()}, horizon_ns
             )
-            for rate in rates
+            for rate in next(iter(self.levels.values()))
         }
 
     def to_table(self) -> pa.Table:

@@ -37,7 +37,6 @@ NEEDED: Mapping[str, model_files.Kind] = {
     "chosen": str,
     "estimator": dict,
     "baselines": dict,
-    "baseline_levels": dict,
     "params": dict,
     "trained_on": dict,
 }

@@ -132,5 +132,3 @@ class SlipConfig(ModelConfig):
     calibration: CalibrationConfig
     estimator: dict[str, Any]  # settings of the estimator that are not arrays
     baselines: dict[str, dict[str, Any]]  # baseline -> its settings that are not arrays
-    # baseline -> false alarms per minute -> lowest score that raises an alarm
-    baseline_levels: dict[str, dict[str, float]]

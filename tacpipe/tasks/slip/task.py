@@ -65,7 +65,7 @@ class SlipTask(Task):
     requirements = REQUIREMENTS
 
     @staticmethod
-    @stage(version=5, reads=("object", "slip_intervals"))
+    @stage(version=6, reads=("object", "slip_intervals"))
     def train(params: Params, train: Dataset, val: Dataset | None, workspace: Workspace) -> Result:
         """Train a model that predicts slips of a held object.
 

@@ -64,10 +64,7 @@ def train(
     chosen = selection.select(baselines, candidates, outputs, examples, area_losses, params.seed)
     fits = {**baselines, chosen.name: {**candidates, **baselines}[chosen.name]}
     estimators = {name: fit(examples, outputs, "all") for name, fit in fits.items()}
-    calibrations = {
-        name: calibrate_scores(estimator, scores_of(chosen.predicted[name]), examples, held_out, params)
-        for name, estimator in estimators.items()
-    }
+    calibration = calibrate_scores(estimators[chosen.name], scores_of(chosen.outputs), examples, held_out, params)
     stored = params_of.to_json(params)
     objects = sorted({track.object for track in tracks})
     config = {
@@ -86,8 +83,7 @@ def train(
         "chosen": chosen.name,
         "chosen_is_baseline": chosen.name in baselines,
         "candidates": chosen.table,
-        "calibration": calibrations[chosen.name].to_config(),
-        "baseline_levels": {name: calibrations[name].to_config()["levels"] for name in baselines},
+        "calibration": calibration.to_config(),
     }
     files = storage.to_files(config, estimators[chosen.name], {name: estimators[name] for name in baselines})
     return files, selection.notes(chosen, baselines, len(objects))

@@ -13,6 +13,7 @@ from tacpipe.arrays import AnyFloats, Bools, Floats, Indices, Int64s, Times
 from tacpipe.channels.schema import field_metadata
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins.constraints import CommaList
 from tacpipe.plugins.rows import NO_LABEL, NO_WINDOW
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.learning.examples import Examples, join
@@ -184,7 +185,7 @@ def read_training(recordings: Dataset, params: SlipParams) -> tuple[FingerReader
 
 def _tactile_columns(stream: str, schema: pa.Schema, streams: str) -> list[str]:
     """Return the tactile columns of the streams that match patterns; all of them without patterns."""
-    patterns = [word.strip() for word in streams.split(",") if word.strip()]
+    patterns = CommaList().items(streams)
     return [
         name
         for name in tactile.columns(schema, "tactile")

@@ -40,7 +40,7 @@ def predict(
 
 def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
     """Return the table of `predict`. Raises the same errors."""
-    level_indices = predictor.quantiles_of(quantiles)[1] if quantiles else []
+    level_indices = predictor.quantile_places(quantiles)
     grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
         raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the requested role.")

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NotRequired, TypedDict
 
-from tacpipe.plugins import architectures
 from tacpipe.plugins.constraints import (
     CommaList,
     Dropout,
@@ -284,11 +283,6 @@ class Pointnet(PointNetwork):
 
 
 Params = TouchModelParams  # params of any architecture
-
-
-def kind_of(architecture: str) -> type[Params]:
-    """Return the class of an architecture, or of all architectures if its package is not installed."""
-    return architectures.find(Params, architecture) or Params
 
 
 DEFAULT = TouchModelParams.architecture  # default architecture

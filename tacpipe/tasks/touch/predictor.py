@@ -256,9 +256,9 @@ class Predictor:
             predicted, np.array([name not in self.config["objects"] for name in grasps.objects])
         )
 
-    def quantiles_of(self, percents: Sequence[int]) -> tuple[ReadingQuantiles, list[int]]:
-        """Return the quantiles, and the indices of ``percents`` among them; see `tacpipe.tasks.task.quantiles_of`."""
-        return task.quantiles_of(self.quantiles, percents)
+    def quantile_places(self, percents: Sequence[int]) -> list[int]:
+        """Return the places of ``percents`` among the quantiles; see `tacpipe.tasks.task.quantile_places`."""
+        return task.quantile_places(self.quantiles.percents if self.quantiles else (), percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[PredictedReading]:
         """Return the readings of several grasps on one cloud in one pass.

@@ -92,7 +92,7 @@ def test_predict_says_what_is_judged(
     predicted = loaded.predict(*asked(recorded, starts))
     assert predicted.shape == (72, HORIZON, len(CHANNELS))
     assert predicted.dtype == np.float64
-    assert np.allclose(predicted, windows_predicted.predictions["model"].count, atol=0.05)
+    assert np.allclose(predicted, dict(windows_predicted.each_prediction())["model"].count, atol=0.05)
     assert np.abs(predicted - recorded.tactile[windows_predicted.forecast.now][:, None]).max() > 5
 
 
@@ -102,7 +102,10 @@ def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_wi
     loaded = ForwardModel.load(models["gru increments"])
     shard = compressed(TEST, files=latents["increments"].files, representation="increments").recordings[TEST.name]
     recorded, starts, windows_predicted = predicted_windows(loaded, shard)
-    predicted, expected = loaded.predict(*asked(recorded, starts)), windows_predicted.predictions["model"].count
+    predicted, expected = (
+        loaded.predict(*asked(recorded, starts)),
+        dict(windows_predicted.each_prediction())["model"].count,
+    )
     # the first window begins where the recording does, so that nothing is lost
     assert np.allclose(predicted[0], expected[0], atol=0.05)
     assert (
@@ -160,12 +163,12 @@ def test_touch_after_now_does_not_change_what_is_predicted_now(
         shards = [compressed(shard, files=latents["levels"].files).recordings[TEST.name] for shard in shards]
     (_, _, before), (_, _, after) = (predicted_windows(loaded, shard) for shard in shards)
     unaffected = now - CONTEXT + 2  # windows whose last frame of the past is not after ``now``
-    for predictor, prediction in before.predictions.items():
+    for predictor, prediction in before.each_prediction():
         if not predictor.startswith("codec"):  # the loss of the codec depends on the truth
-            changed = after.predictions[predictor].count
+            changed = dict(after.each_prediction())[predictor].count
             assert np.allclose(changed[:unaffected], prediction.count[:unaffected], atol=1e-2), predictor
-    model = before.predictions["model"].count[unaffected]
-    assert not np.allclose(after.predictions["model"].count[unaffected], model, atol=1)
+    model = dict(before.each_prediction())["model"].count[unaffected]
+    assert not np.allclose(dict(after.each_prediction())["model"].count[unaffected], model, atol=1)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -277,7 +280,7 @@ def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
     loaded = ForwardModel.load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
     recorded, starts, windows_predicted = predicted_windows(loaded, shard)
     assert np.allclose(
-        loaded.predict(*asked(recorded, starts)), windows_predicted.predictions["model"].count, atol=0.05
+        loaded.predict(*asked(recorded, starts)), dict(windows_predicted.each_prediction())["model"].count, atol=0.05
     )
     assert recorded.arm[0, 7:].any()
 

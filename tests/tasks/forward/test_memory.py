@@ -3,7 +3,6 @@
 import tracemalloc
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tacpipe.io.spill import Spill
@@ -40,15 +39,3 @@ def test_the_evaluation_of_a_longer_recording_takes_hardly_more_besides_its_trac
     short, long = (peak_bytes(forecaster, rows) for rows in (ROWS, 3 * ROWS))
     grown = (long - short) / (2 * ROWS)  # bytes a row
     assert grown < 25, grown
-
-
-def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:
-    forecaster = Forecaster.load(trained(tmp_path))
-    track = tracks.track(motion(0, rows=200), forecaster.codec)  # type: ignore[arg-type]
-    (batch,) = predictors.iterate_predictions(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
-    stored = dict(batch.predictions.items())
-    assert list(stored) == list(batch.predictions) and len(stored) == len(batch.predictions) > 5
-    for name, prediction in stored.items():
-        assert np.array_equal(prediction.count, batch.predictions[name].count)
-    with pytest.raises(KeyError):
-        batch.predictions["another"]

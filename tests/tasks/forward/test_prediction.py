@@ -29,7 +29,7 @@ def test_each_row_holds_what_the_model_says_of_the_steps_asked_for(model: dict[s
     assert table["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
     for channel, name in enumerate(CHANNELS):
         for step in (1, 4):
-            expected = windows.predictions["model"].count[:, step - 1, channel]
+            expected = dict(windows.each_prediction())["model"].count[:, step - 1, channel]
             assert np.allclose(table[f"{name}_t{step}"].to_numpy(), expected, rtol=1e-5)
     about = table.schema.field(f"{CHANNELS[0]}_t4").metadata
     assert about[b"quantity"] == b"prediction" and about[b"step"] == b"4" and about[b"taxel"] == b"1"

@@ -158,7 +158,7 @@ def test_a_rig_without_a_stream_or_channel_of_the_model_is_refused(skins: Skins,
     with pytest.raises(UsageError, match="The model reads the stream right, and there are left"):
         windows_for(model, [SYNCHRONIZE], {"left": schemas["left"]}, "left", None)
     fewer = {**schemas, "right": schemas["right"].remove(schemas["right"].get_field_index("taxel01_x"))}
-    with pytest.raises(UsageError, match="The stream right has no channel of right_taxel01_x"):
+    with pytest.raises(UsageError, match="The stream right has no channel right_taxel01_x"):
         windows_for(model, [SYNCHRONIZE], fewer, "left", None)
 
 

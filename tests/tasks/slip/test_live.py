@@ -256,7 +256,9 @@ def session_recording(rig: Rig, model: SlipModel, change: float = 0.0) -> FakeRe
             "alarm": pa.array(np.zeros(table.num_rows, np.int8)),
         }
     )
-    latency = pa.table({"t_ns": table["t_ns"], "latency_ms": np.full(table.num_rows, 4.0, np.float32)})
+    columns = {"latency_ms": 4.0, "late": 0.0, "skipped": 0.0}
+    figures = {name: np.full(table.num_rows, value, np.float32) for name, value in columns.items()}
+    latency = pa.table({"t_ns": table["t_ns"], **figures})
     return dataclasses.replace(rig.recording, tables={**rig.recording.tables, "slip": stream, "latency": latency})
 
 

@@ -21,7 +21,7 @@ from tacpipe.io import Json
 from tacpipe.live.decoding import BatchColumns
 from tacpipe.live.plans import PlanHistory
 from tacpipe.live.rows import SynchronizedRows
-from tacpipe.live.stages import live_channels
+from tacpipe.live.stages import live_channels, refuse_look_ahead
 from tacpipe.models.tensors import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
@@ -32,9 +32,9 @@ from tacpipe.synchronization.causal import GridRows
 from tacpipe.tasks.forward import causal, headline
 from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.live.inputs import InputLayout, plan_table
+from tacpipe.tasks.forward.live.inputs import InputLayout
 from tacpipe.tasks.forward.live.plans import Targets, facing
-from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
+from tacpipe.tasks.forward.live.stages import causal_stages
 from tacpipe.video.channels import LiveChannels
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class LiveChain:
         # channels computed from frames, by stream; None if the session's first frame, to which they refer, is missing
         self._cameras = dict(cameras or {})
         # indices, among the model's quantiles, of those that are published
-        self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []
+        self._quantiles = forecaster.quantile_places(quantiles)
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
@@ -206,11 +206,6 @@ class LiveChain:
         return tuple(dict.fromkeys([*self._layout.columns, *([plans] if self.reads_plan else [])]))
 
     @property
-    def waiting(self) -> tuple[str, ...]:
-        """The `streams` without a sample so far; without a sample of the master, there are no grid points."""
-        return self._grid.waiting
-
-    @property
     def master(self) -> str:
         """The stream whose samples start the grid."""
         return self._layout.master
@@ -227,19 +222,9 @@ class LiveChain:
         return self._forecaster.horizon
 
     @property
-    def context(self) -> int:
-        """The number of rows that are read."""
-        return self._forecaster.context
-
-    @property
     def channels(self) -> tuple[str, ...]:
         """The names of the predicted channels, such as ``xela1_taxel01_z``."""
         return tuple(self._forecaster.codec.channels)
-
-    @property
-    def layout(self) -> tuple[Mapping[str, str], ...]:
-        """Stream, taxel and axis of each channel."""
-        return tuple(self._forecaster.codec.layout)
 
     @property
     def unit(self) -> str:
@@ -247,19 +232,9 @@ class LiveChain:
         return str(self._forecaster.config["inputs"].get("unit", headline.COUNT))
 
     @property
-    def forecaster(self) -> Forecaster:
-        """The model."""
-        return self._forecaster
-
-    @property
     def reads_plan(self) -> bool:
         """Whether the model reads planned motion."""
         return self._forecaster.actions == "planned" and bool(self._forecaster.pose.position)
-
-    @property
-    def rest(self) -> Floats | None:
-        """The rest level (channel,), or None until it is known."""
-        return self._rest
 
     @property
     def beginning(self) -> Json | None:
@@ -301,16 +276,6 @@ class LiveChain:
         """Take the plans of an earlier chain of the session, and its cameras' channels, which know the untouched gels."""
         self._cameras, self._plans, self._targets = dict(previous._cameras), previous._plans, previous._targets
 
-    def plan(self, arrived_ns: int, t_ns: Times, poses: AnyFloats) -> None:
-        """Set the planned motion that arrived at ``arrived_ns``; it replaces the previous plan.
-
-        ``t_ns`` (point,) are the ascending times, by the clock of the samples, at which the hand is to be at ``poses``
-        (point, 3 or 7): position in m and quaternion x, y, z, w in the frame of the recorded pose. Between points, the
-        position is interpolated linearly and the orientation along the shorter arc. This is equivalent to pushing the
-        rows of `inputs.plan_table`, which a session records. Raises `TacpipeError` for other shapes.
-        """
-        self._push_plans(plan_table(arrived_ns, t_ns, poses))
-
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[GridForecast]:
         """Return the forecasts of the grid points up to ``t_ns``, up to which all samples must have been pushed.
 
@@ -340,11 +305,11 @@ class LiveChain:
         """Return the row ``index`` of the grid, in the form that the model reads."""
         t_ns, arrival_ns = int(rows.t_ns[index]), int(rows.arrival_ns[index])
         gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
-        values = {name: columns[index] for name, columns in rows.values.items()}
         layout = self._layout
-        arm = self._arm.row(t_ns, *layout.arm_state(values))
+        row = layout.row({name: columns[index] for name, columns in rows.values.items()})
+        arm = self._arm.row(t_ns, *layout.arm_state(row))
         at_arrival = bool(rows.at_arrival[index])
-        return _Row(t_ns, arrival_ns, layout.tactile(values), arm, layout.finger_m(values), gaps, at_arrival)
+        return _Row(t_ns, arrival_ns, row[layout.tactile], arm, layout.finger_m(row), gaps, at_arrival)
 
     def _forecast(self, row: _Row, unneeded: Cause) -> GridForecast:
         """Add a row and return its forecast, which has no values until the rest level is known and the window is full.

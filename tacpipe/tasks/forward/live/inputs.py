@@ -1,4 +1,4 @@
-"""Find the inputs of a forecaster in the streams of a rig, and create streams of planned motion."""
+"""Find the inputs of a forecaster in the streams of a rig."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Floats, Indices, Times
+from tacpipe.arrays import Floats, Indices
 from tacpipe.channels import arm as poses
-from tacpipe.channels.schema import field_metadata, time_field
+from tacpipe.channels.schema import field_metadata
 from tacpipe.channels.streams import EVENTS, count_axes
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed
-from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tare_level
 from tacpipe.synchronization import streams
 from tacpipe.synchronization.streams import may_be_signal
@@ -25,55 +24,22 @@ from tacpipe.tasks.forward.forecaster import Forecaster
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Place = tuple[str, Indices]  # a stream, and columns of its samples
-
-
-def plan_schema() -> pa.Schema:
-    """Return the schema of the stream of plans: arrival, time at which the hand is to be at the pose, and the pose.
-
-    Rows with the same arrival are one plan.
-    """
-    import pyarrow as pa
-
-    return pa.schema([time_field(), *plan.Plan().fields()])
-
-
-def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
-    """Return a plan as rows of `plan_schema`, from ``poses`` (point, 3 or 7) at ascending times ``t_ns`` (point,).
-
-    Without quaternions the orientation is NaN: the hand keeps its orientation. Raises `TacpipeError` for other shapes,
-    a position that is not finite, or times that are not ascending.
-    """
-    import pyarrow as pa
-
-    t_ns, poses = np.asarray(t_ns, np.int64), np.asarray(poses, np.float64)
-    if poses.ndim != 2 or poses.shape[1] not in (3, 7) or len(poses) != len(t_ns) or not len(t_ns):
-        raise TacpipeError(
-            f"A plan has {len(t_ns)} times and poses of shape {poses.shape}; it needs one pose a time, one at least, of 3 "
-            f"numbers (position in m) or of 7 (and a quaternion x, y, z, w)."
-        )
-    if (np.diff(t_ns) <= 0).any() or not np.isfinite(poses).all():
-        raise TacpipeError("The times of a plan must ascend, and all its numbers be finite.")
-    rows = np.full((len(poses), plan.NUMBERS), np.nan)
-    rows[:, : poses.shape[1]] = poses
-    arrays = [pa.array(np.full(len(t_ns), arrived_ns, np.int64)), pa.array(t_ns), *map(pa.array, rows.T)]
-    return pa.Table.from_arrays(arrays, schema=plan_schema())
-
 
 @dataclass(frozen=True)
 class InputLayout:
     """Where the inputs of a forecaster are in the samples of a rig's streams."""
 
     master: str
-    columns: Mapping[str, list[str]]  # stream -> columns that are read
+    columns: Mapping[str, list[str]]  # stream -> columns that are read; others may be added after them
     schemas: Mapping[str, pa.Schema]
-    tactile_of: Mapping[str, tuple[Indices, Indices]]  # stream -> its columns and their channels
-    axes: Mapping[str, int]  # stream -> axes of its taxels
-    kinds: Mapping[str, np.dtype[Any]]  # stream -> type in which rest levels are computed
-    position: Place | None
-    orientation: Place | None
-    joints: tuple[Place, Place] | None  # angles and speeds
-    finger: Place | None
+    widths: Mapping[str, int]  # stream -> number of columns of the inputs, which follow one another in a row
+    tactile: Indices  # (channel,), places in a row, as all that follow; empty for what is not recorded
+    position: Indices
+    orientation: Indices
+    angles: Indices
+    speeds: Indices
+    finger: Indices
+    rest_parts: Sequence[tuple[Indices, int, np.dtype[Any]]]  # channels of a stream, axes of its taxels, type of levels
     position_m: Floats  # (3,), size of each coordinate's unit in metres
     finger_scale_m: float
 
@@ -101,98 +67,79 @@ class InputLayout:
         )
         _check(forecaster, signals, grid)
         leader = streams.master("of this rig", synchronize.master or master, signals)
-        columns: dict[str, list[str]] = {leader: []}
-
-        def place_columns(names: Sequence[str]) -> Place | None:
-            """Add columns of one stream to ``columns``; return the stream and their indices, or None without names."""
-            if not names:
-                return None
-            stream = origin[names[0]][0]
-            stream_columns = columns.setdefault(stream, [])
-            for grid_column in names:
-                if origin[grid_column][1] not in stream_columns:
-                    stream_columns.append(origin[grid_column][1])
-            return stream, np.array([stream_columns.index(origin[grid_column][1]) for grid_column in names], np.intp)
-
-        by_stream: dict[str, list[int]] = {}
-        for index, name in enumerate(forecaster.codec.channels):
-            by_stream.setdefault(origin[name][0], []).append(index)
-        tactile_of: dict[str, tuple[Indices, Indices]] = {}
-        axes: dict[str, int] = {}
-        kinds: dict[str, np.dtype[Any]] = {}
-        for stream, indices in by_stream.items():
-            names = [forecaster.codec.channels[index] for index in indices]
-            place = place_columns(names)
-            assert place is not None
-            tactile_of[stream] = (place[1], np.array(indices, np.intp))
-            axes[stream] = count_axes(grid, names)
-            kind = np.result_type(*(grid.field(name).type.to_pandas_dtype() for name in names))
-            kinds[stream] = kind if kind.kind == "f" else np.dtype(np.float64)
-        pose = forecaster.pose
-        position, orientation = place_columns(pose.position), place_columns(pose.orientation)
+        channels, pose = forecaster.codec.channels, forecaster.pose
         angles, speeds = tracks.joints(grid, pose)
-        has_joints = len(angles) == len(speeds) == tracks.JOINTS
+        if not len(angles) == len(speeds) == tracks.JOINTS:
+            angles, speeds = (), ()
         opening = tracks.opening(grid)
-        joints = (place_columns(angles), place_columns(speeds)) if has_joints else (None, None)
-        finger = place_columns([opening] if opening else [])
+        inputs = (channels, pose.position, pose.orientation, angles, speeds, (opening,) if opening else ())
+        columns: dict[str, list[str]] = {leader: []}
+        for stream, column in (origin[name] for names in inputs for name in names):
+            if column not in columns.setdefault(stream, []):
+                columns[stream].append(column)
+        widths = {stream: len(names) for stream, names in columns.items()}
+        starts = dict(zip(widths, np.cumsum([0, *widths.values()]), strict=False))
+        tactile_places, position, orientation, angle_places, speed_places, finger = (
+            np.array(
+                [starts[origin[name][0]] + columns[origin[name][0]].index(origin[name][1]) for name in names], np.intp
+            )
+            for names in inputs
+        )
+        rest_parts = []
+        for stream in dict.fromkeys(origin[name][0] for name in channels):
+            own = np.array([index for index, name in enumerate(channels) if origin[name][0] == stream], np.intp)
+            names = [channels[index] for index in own]
+            kind = np.result_type(*(grid.field(name).type.to_pandas_dtype() for name in names))
+            rest_parts.append((own, count_axes(grid, names), kind if kind.kind == "f" else np.dtype(np.float64)))
         return cls(
             leader,
             columns,
             signals,
-            tactile_of,
-            axes,
-            kinds,
+            widths,
+            tactile_places,
             position,
             orientation,
-            None if joints[0] is None or joints[1] is None else (joints[0], joints[1]),
+            angle_places,
+            speed_places,
             finger,
+            rest_parts,
             np.array([poses.metres_per_unit(grid.field(name)) for name in pose.position]),
             poses.metres_per_unit(grid.field(opening)) if opening else 1.0,
         )
 
-    def tactile(self, values: Mapping[str, Floats]) -> Floats:
-        """Return the tactile channels (channel,) of a row, given as ``values`` (column,) by stream."""
-        row = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
-        for stream, (columns, channels) in self.tactile_of.items():
-            row[channels] = values[stream][columns]
-        return row
+    def row(self, values: Mapping[str, Floats]) -> Floats:
+        """Return the columns of all inputs of a row, given as ``values`` (column,) by stream."""
+        return np.concatenate([values[stream][:width] for stream, width in self.widths.items()])
 
     def levels(self, rest_levels: Sequence[float]) -> dict[str, Floats]:
         """Return levels of channels (channel,) by stream as columns (column,), NaN for other columns."""
-        by_stream = {name: np.full(len(names), np.nan) for name, names in self.columns.items()}
-        for stream, (columns, channels) in self.tactile_of.items():
-            by_stream[stream][columns] = np.asarray(rest_levels)[channels]
-        return by_stream
+        row = np.full(sum(self.widths.values()), np.nan)
+        row[self.tactile] = rest_levels
+        parts = np.split(row, np.cumsum([*self.widths.values()])[:-1])
+        return {
+            stream: np.pad(part, (0, len(names) - len(part)), constant_values=np.nan)
+            for part, (stream, names) in zip(parts, self.columns.items(), strict=True)
+        }
 
-    def arm_state(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
-        """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, from rows by stream."""
-        position, quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
-        if self.position is not None:
-            stream, columns = self.position
-            position = values[stream][columns] * self.position_m
-        if self.orientation is not None:
-            stream, columns = self.orientation
-            quaternion = values[stream][columns]
-        if self.joints is None:
-            return position, quaternion, None, None
-        angles, speeds = (values[stream][columns] for stream, columns in self.joints)
-        return position, quaternion, angles, speeds
+    def arm_state(self, row: Floats) -> tuple[Floats, Floats, Floats | None, Floats | None]:
+        """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, of a `row`."""
+        position = row[self.position] * self.position_m if len(self.position) else np.zeros(3)
+        quaternion = row[self.orientation] if len(self.orientation) else np.array([0.0, 0.0, 0.0, 1.0])
+        has_joints = len(self.angles) > 0
+        return position, quaternion, row[self.angles] if has_joints else None, row[self.speeds] if has_joints else None
 
-    def finger_m(self, values: Mapping[str, Floats]) -> float:
-        """Return the width between the fingers in m of a row, or 0 if it is not recorded."""
-        if self.finger is None:
-            return 0.0
-        stream, columns = self.finger
-        return float(np.float32(values[stream][columns[0]] * self.finger_scale_m))
+    def finger_m(self, row: Floats) -> float:
+        """Return the width between the fingers in m of a `row`, or 0 if it is not recorded."""
+        return float(np.float32(row[self.finger[0]] * self.finger_scale_m)) if len(self.finger) else 0.0
 
     def rest_levels(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
         """Return each channel's rest level (channel,) from rows at rest, by the params of `segment contacts`."""
         stacked = np.stack(rows)  # (row, channel)
         levels = np.empty(stacked.shape[1])
         t_ns = np.zeros(len(rows), np.int64)  # equal timestamps, so that the rest level uses all rows
-        for stream, (_, channels) in self.tactile_of.items():
-            values = stacked[:, channels].astype(self.kinds[stream])
-            levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
+        for channels, axes, kind in self.rest_parts:
+            values = stacked[:, channels].astype(kind)
+            levels[channels] = tare_level(contacts.tare, values, rest_level(values, t_ns, 0.0), axes)
         return levels
 
 

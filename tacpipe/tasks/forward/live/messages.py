@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.arrays import Float32s
 from tacpipe.io import JsonObject
 from tacpipe.live import messages
-from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values
+from tacpipe.live.messages import ABSENT, Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 FORECAST = "forecast"  # the recorded stream
@@ -138,11 +138,10 @@ class ForecastDescription(messages.Description):
         """The fields that are absent: quantiles, if the session publishes none."""
         return ABSENT if self.quantiles else QUANTILES
 
-    def to_dict(self) -> JsonObject:
-        """Return the description for JSON and msgpack."""
+    @property
+    def details(self) -> JsonObject:
+        """What it states beside the kind of the messages."""
         return {
-            "version": VERSION,
-            "kind": "description",
             "channels": list(self.channels),
             "steps": list(self.steps),
             "unit": self.unit,

@@ -38,8 +38,7 @@ def predict(
     model reads.
     """
     forecaster = Forecaster.load(model.files)
-    if quantiles:
-        forecaster.quantiles_of(quantiles)
+    forecaster.quantile_places(quantiles)
     outputs: dict[str, RecordingOutput] = {}
     notes, unplanned, row_count = [], 0, 0
     with terminal.progress_bar("predict", len(recordings.recordings)) as advance:
@@ -79,27 +78,33 @@ def _predict_recording(
     tables = extracted_streams(recording, model.source.chain, streams_as_recorded(recording))
     chain = build_chain(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
-    t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
-    step_indices = [step - 1 for step in steps]
-    for forecast in iterate_forecasts(chain, tables):
+    forecasts = list(iterate_forecasts(chain, tables))
+    causes = Counter[Cause]()
+    for forecast in forecasts:
         causes.update(forecast.cause)
-        if forecast.count is not None:
-            t_ns.append(forecast.t_ns)
-            counts.append(forecast.count[step_indices])
-        if forecast.quantiles is not None:
-            bands.append(forecast.quantiles[step_indices])
-    shape = len(step_indices), len(chain.channels)
-    all_counts = np.stack(counts) if counts else np.zeros((0, *shape), np.float32)
-    all_bands = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
-    table = prediction_table(
-        forecaster,
-        np.array(t_ns, np.int64),
-        all_counts.transpose(1, 2, 0).copy(),
-        steps,
-        dict(zip(quantiles, all_bands.transpose(3, 1, 2, 0).copy(), strict=True)),
-    )
+    table = forecast_table(forecaster, forecasts, steps, quantiles)
     described = {f"forecast_{_name(cause)}": causes[cause] for cause in sorted(causes, key=lambda cause: cause.value)}
     return RecordingOutput(table, {"causal": True, "level_at_rest": chain.rest_rows, **described}), causes
+
+
+def forecast_table(
+    forecaster: Forecaster, forecasts: Sequence[GridForecast], steps: Sequence[int], quantiles: Sequence[int]
+) -> pa.Table:
+    """Return the forecasts with values in the form of `tasks.forward.prediction.predict`."""
+    step_indices = [step - 1 for step in steps]
+    valued = [forecast for forecast in forecasts if forecast.count is not None]
+    shape = len(steps), len(forecaster.codec.channels)
+    counts = np.array([forecast.count[step_indices] for forecast in valued if forecast.count is not None], np.float32)
+    nothing = np.zeros((*shape, 0), np.float32)
+    bands = [nothing if forecast.quantiles is None else forecast.quantiles[step_indices] for forecast in valued]
+    stacked = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
+    return prediction_table(
+        forecaster,
+        np.array([forecast.t_ns for forecast in valued], np.int64),
+        counts.reshape(-1, *shape).transpose(1, 2, 0).copy(),
+        steps,
+        dict(zip(quantiles, stacked.transpose(3, 1, 2, 0).copy(), strict=True)),
+    )
 
 
 def build_chain(

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.channels.streams import GRID, max_step
 from tacpipe.errors import TacpipeError
-from tacpipe.live.stages import CHANNELS, stage_params
+from tacpipe.live.stages import CHANNELS, SYNCHRONIZE, stage_params
 
 if TYPE_CHECKING:
     from tacpipe.store.records import Step
-    from tacpipe.tasks.forward.params import ForwardConfig
 
-SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
+CONTACTS, COMPRESS = "segment.contacts", "compress."
 
 
 class CausalStages(NamedTuple):
@@ -54,27 +53,3 @@ def causal_stages(steps: Sequence[Step]) -> CausalStages:
             f"complete recording for the rest level. A session takes it from the start. Train it with --rest start."
         )
     return CausalStages(params_by_stage[SYNCHRONIZE], params_by_stage[CONTACTS])
-
-
-def refuse_look_ahead(config: ForwardConfig, steps: Sequence[Step]) -> None:
-    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
-
-    ``config`` is the model's configuration, ``steps`` are its preprocessing stages.
-    """
-    look_ahead = config.get("look_ahead")
-    if look_ahead is None:  # the recordings lack this information
-        interpolated = [
-            step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
-        ]
-        text = "their values are interpolated" if interpolated else ""
-    else:
-        text = (
-            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
-            if look_ahead["max_ms"]
-            else ""
-        )
-    if text:
-        raise TacpipeError(
-            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
-            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
-        )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import PositiveInt
 from tacpipe.plugins.stage import Attribute, Result
@@ -54,7 +54,7 @@ class ForwardLive(LiveTask):
     def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
         """Return the streams of forecasts and latencies, and the rig with a stream of plans if needed."""
         from tacpipe.live import plans
-        from tacpipe.tasks.forward.live.stages import refuse_look_ahead
+        from tacpipe.live.stages import refuse_look_ahead
 
         config: ForwardConfig = model_files.tree(
             model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list}
@@ -66,9 +66,9 @@ class ForwardLive(LiveTask):
         with settings.naming("steps"):
             steps = own_settings.steps_up_to(config["horizon"])
         levels = tuple(sorted(set(own_settings.quantiles)))
-        if levels:
-            with settings.naming("quantiles"):
-                _refuse_absent_quantiles(config, levels, task.quantiles_of)
+        calibrated = config.get("quantiles")
+        with settings.naming("quantiles"):
+            task.quantile_places(calibrated["levels"] if calibrated else (), levels)
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
         unit = str(config["inputs"].get("unit", "count"))
@@ -81,10 +81,7 @@ class ForwardLive(LiveTask):
         return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
 
     def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
-        """Return the engine with the model's causal chain, after a first forecast.
-
-        Raises `UsageError` for steps that the model does not predict.
-        """
+        """Return the engine with the model's causal chain, after a first forecast."""
         from tacpipe.live import plans
         from tacpipe.live.decoding import likely_schema
         from tacpipe.tasks.forward.forecaster import Forecaster
@@ -111,8 +108,6 @@ class ForwardLive(LiveTask):
             settle_ns=round(settings.settle_ms * 1e6),
             quantiles=own_settings.quantiles,
         )
-        if own_settings.steps and max(own_settings.steps) > engine.rows.horizon:
-            raise UsageError(f"The model predicts 1 to {engine.rows.horizon} steps ahead; give --steps of these.")
         forecaster.prepare_single()
         return engine
 
@@ -133,22 +128,3 @@ class ForwardLive(LiveTask):
 def _forward_settings(settings: Settings) -> ForwardSettings:
     assert isinstance(settings.task, ForwardSettings)
     return settings.task
-
-
-def _refuse_absent_quantiles(
-    config: ForwardConfig, levels: tuple[int, ...], find_quantiles: Callable[[Any, tuple[int, ...]], Any]
-) -> None:
-    """Raise `UsageError` for quantiles that the model does not have."""
-    description = config.get("quantiles")
-    calibrated_levels = CalibratedLevels(tuple(description["levels"]) if description else ())
-    try:
-        find_quantiles(calibrated_levels if calibrated_levels.percents else None, levels)
-    except TacpipeError as error:
-        raise UsageError(str(error)) from error
-
-
-@dataclass(frozen=True)
-class CalibratedLevels:
-    """The quantiles for which a model was calibrated."""
-
-    percents: tuple[int, ...]

@@ -93,7 +93,6 @@ class ForwardReport(TaskReport):
             *pictures.skill_folds(context),
             *pictures.forecast_folds(context),
             *coverage_folds(context, "step", steps, headline.BASELINE, unit, headline.PARTS, bands),
-            *pictures.live_folds(context),
         ]
 
     def caveats(self, context: Context) -> list[str]:

@@ -1,4 +1,4 @@
-"""Draw the skill of forecasts by time ahead and forecasts next to measurements, and list errors of live sessions."""
+"""Draw the skill of forecasts by time ahead, and forecasts next to measurements."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import Comparison, ComparisonRow
 from tacpipe.comparison.runs import MODEL, Question
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold, table
+from tacpipe.report.blocks import Chart, Charts, Fold, SmallPrint, fold
 from tacpipe.report.charts import Curve
-from tacpipe.report.context import Context, median_run, read_json
+from tacpipe.report.context import Context, median_run
 from tacpipe.scores import intervals, pairing
 from tacpipe.scores.intervals import Interval
 from tacpipe.scores.pairing import Sums
@@ -96,18 +96,6 @@ def skill_folds(context: Context) -> list[Fold]:
         caption = f"Grey line: persistence. {charts.explain_lines(spec, comparison.measure.cluster)}"
         drawn.append(Chart(f"Skill by time ahead: {comparison.question.where}", spec, caption))
     return fold("By time ahead", Charts(drawn)) if drawn else []
-
-
-def live_folds(context: Context) -> list[Fold]:
-    """Return the errors, rows and latencies of each result that has recordings of live sessions."""
-    folds: list[Fold] = []
-    for run in context.runs:
-        live = read_json(run.dataset, "metrics.json").get("live")
-        if live:
-            tree = {name: live[name] for name in ("mae", "rows", "latency")}
-            rows = [[name, value] for name, value in blocks.leaves(tree).items()]
-            folds += fold("Live sessions", table("", ["", "value"], rows), about=run.method)
-    return folds
 
 
 def _median_runs(context: Context) -> list[tuple[str, ComparedRun]]:

@@ -17,6 +17,7 @@ from tacpipe.plugins.stage import Result
 if TYPE_CHECKING:
     import pyarrow as pa
 
+BITS: Mapping[str, type[np.signedinteger[Any]]] = {"double": np.int64, "float": np.int32}  # bits of compared columns
 # a recording, the times of its answers (row,) and its published columns at these -> further figures
 Measure = Callable[[Recording, Times, Mapping[str, Any]], Mapping[str, Any]]
 
@@ -40,7 +41,12 @@ def evaluate(
     totals = {key: sum(session[key] for session in sessions.values()) for key in ("published", "compared", "equal")}
     notes = [
         f"{totals['equal']} of {totals['compared']} published answers are what `tacpipe predict --causal` gives, bit for "
-        f"bit."
+        f"bit.",
+        *(
+            f"{name}: latency median {figures['median_ms']:.1f} ms, 99 % {figures['p99_ms']:.1f} ms."
+            for name, session in sessions.items()
+            if (figures := session["latency"])["count"]
+        ),
     ]
     metrics = {"live": {**totals, "recordings": sessions}}
     return Result(
@@ -53,7 +59,7 @@ def _session(recording: Recording, stream: pa.Table, predicted: pa.Table, measur
     """Return the figures of one recorded session."""
     clock = "t_device_ns" if "t_device_ns" in stream.column_names else "t_ns"
     compared = [
-        field.name for field in predicted.schema if field.name in stream.column_names and str(field.type) == "double"
+        field.name for field in predicted.schema if field.name in stream.column_names and str(field.type) in BITS
     ]
     columns = {name: stream[name].to_numpy() for name in stream.column_names}
     answered = np.asarray(np.isfinite([columns[name] for name in compared]).all(axis=0))
@@ -62,11 +68,14 @@ def _session(recording: Recording, stream: pa.Table, predicted: pa.Table, measur
     equal = np.ones(len(rows), bool)
     for name in compared:
         computed = predicted[name].to_numpy()[predicted_rows]
-        equal &= published[name][rows].view(np.int64) == computed.view(np.int64)
+        bits = BITS[str(predicted.schema.field(name).type)]
+        equal &= published[name][rows].view(bits) == computed.view(bits)
+    latency = recording.table("latency")
     return {
         "published": int(answered.sum()),
         "compared": len(rows),
         "equal": int(equal.sum()),
-        "latency": summarize_latencies(recording.table("latency")["latency_ms"].to_numpy()),
+        "latency": summarize_latencies(latency["latency_ms"].to_numpy()),
+        **{name: int(latency[name].to_numpy().max(initial=0)) for name in ("late", "skipped")},
         **measure(recording, published[clock], published),
     }

@@ -12,7 +12,7 @@ import numpy as np
 from tacpipe.arrays import Floats
 from tacpipe.io import Json
 from tacpipe.live import messages
-from tacpipe.live.messages import VERSION, Sizes, head_values
+from tacpipe.live.messages import Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 ESTIMATE, CLASS = "estimate", "class"  # kinds of messages and names of the recorded streams
@@ -219,15 +219,13 @@ class LearnedDescription(messages.Description):
         """The names of targets or classes, and the units."""
         return Sizes(self.names, unit=",".join(self.units) if self.units else "1")
 
-    def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+    @property
+    def details(self) -> Json:
+        """What it states beside the kind of the messages."""
         named = (
             {"targets": dict(zip(self.names, self.units, strict=True))} if self.units else {"classes": list(self.names)}
         )
         return {
-            "version": VERSION,
-            "kind": "description",
-            "of": self.kind,
             "model": self.model,
             "rate_hz": self.rate_hz,
             **named,

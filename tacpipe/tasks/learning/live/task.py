@@ -7,10 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import TacpipeError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.printable import listed
 from tacpipe.sensors.live import Declaration
 from tacpipe.tasks.learning.live.messages import CLASS, CLASSES, ESTIMATE, ESTIMATES
 
@@ -43,12 +42,7 @@ class LearnedLive(LiveTask):
         """
         config = model_files.tree(model.files, model_files.CONFIG, {"inputs": list, "answers": dict, "params": dict})
         check_causal(model.source.chain, config, allow_look_ahead=settings.allow_look_ahead)
-        for stream in config["inputs"]:
-            if stream["stream"] not in rig.streams:
-                raise UsageError(
-                    f"The model reads the stream {stream['stream'] or 'of a single table'}, and the rig has "
-                    f"{listed(rig.streams)}. Take the rig that the model was trained on."
-                )
+        require_inputs(config, model.source.chain, rig)
         targets = config["answers"].get("targets")
         options: Options = {
             "channels": [target["name"] for target in targets] if targets else config["answers"]["classes"]
@@ -131,26 +125,39 @@ def causal_answers(
 
 def check_causal(chain: Sequence[Step], config: Mapping[str, Any], *, allow_look_ahead: bool) -> None:
     """Raise `TacpipeError` for a model of rows that a session cannot compute, or that looks ahead."""
-    from tacpipe.live.stages import stage_params
+    from tacpipe.live.stages import refuse_look_ahead
 
-    for step in chain:
-        if step["stage"] not in CAUSAL:
-            raise TacpipeError(
-                f"The model was trained on the output of `tacpipe {step['stage'].replace('.', ' ')}`, which a session does "
-                f"not run. Train it on recordings, or on the output of `tacpipe synchronize`."
-            )
+    require_stages(chain, CAUSAL)
     params = config["params"]
     if params.get("recentre") and "level_from" not in config:
         raise TacpipeError(
             f"The model subtracts the median over all rows of each {params['recentre']}, which a session cannot know. Run "
             f"`tacpipe recentre MODEL RECORDINGS -o ADAPTED` on recordings of the session, and give the new model."
         )
-    synchronize = next((stage_params(step) for step in chain if step["stage"] == SYNCHRONIZE), None)
-    if synchronize is not None and synchronize.values == "interpolate" and not allow_look_ahead:
-        raise TacpipeError(
-            "The model was trained on rows whose values are interpolated, and a live session has no later samples. Train it "
-            "on rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
-        )
+    if not allow_look_ahead:
+        refuse_look_ahead(config, chain)
+
+
+def require_stages(chain: Sequence[Step], allowed: Collection[str] = ()) -> None:
+    """Raise `TacpipeError` for a model that was trained on the output of a stage that a session does not run."""
+    for step in chain:
+        if step["stage"] not in allowed:
+            or_synchronized = ", or on the output of `tacpipe synchronize`" if SYNCHRONIZE in allowed else ""
+            raise TacpipeError(
+                f"The model was trained on the output of `tacpipe {step['stage'].replace('.', ' ')}`, which a session does "
+                f"not run. Train it on recordings{or_synchronized}."
+            )
+
+
+def require_inputs(config: Mapping[str, Any], chain: Sequence[Step], rig: Rig) -> None:
+    """Raise `UsageError` if a rig lacks a stream or a channel of a model with this configuration."""
+    from tacpipe.live.decoding import likely_schema
+    from tacpipe.tasks.learning.live.windows import recorded_names
+
+    schemas = {name: likely_schema(stream.sensor) for name, stream in rig.streams.items()}
+    synchronized = any(step["stage"] == SYNCHRONIZE for step in chain)
+    for stream in config["inputs"]:
+        recorded_names(stream["stream"], stream["channels"], schemas, synchronized=synchronized)
 
 
 def windows_for(

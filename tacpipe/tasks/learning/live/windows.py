@@ -208,7 +208,7 @@ class SynchronizedWindows(LiveWindows):
         super().__init__(inputs, beginning, master)
         columns: dict[str, list[str]] = {master: []}
         for stream in inputs.streams:
-            columns[stream.stream] = _recorded_names(stream, schemas)
+            columns[stream.stream] = recorded_names(stream.stream, stream.channels, schemas, synchronized=True)
         gap_ns = dict.fromkeys(columns, GAP_NS)
         self._synchronized = SynchronizedRows(columns, schemas, master, synchronize, gap_ns, arrivals=arrivals)
 
@@ -263,12 +263,23 @@ def replayed(windows: LiveWindows, tables: Mapping[str, pa.Table]) -> Iterator[L
         yield from windows.advance(until_ns)
 
 
-def _recorded_names(stream: InputStream, schemas: Mapping[str, pa.Schema]) -> list[str]:
-    """Return the names of a synchronized stream's channels as they are recorded. Raises `UsageError` if one is missing."""
-    if stream.stream not in schemas:
-        raise UsageError(f"The model reads the stream {stream.stream}, and there are {listed(schemas)}.")
-    recorded = {grid_name(stream.stream, name): name for name in schemas[stream.stream].names}
-    missing = [name for name in stream.channels if name not in recorded]
+def recorded_names(
+    stream: str, channels: Sequence[str], schemas: Mapping[str, pa.Schema], *, synchronized: bool
+) -> list[str]:
+    """Return the names of a model's channels in a recorded stream, of which a synchronized model has other names.
+
+    Raises `UsageError` if the stream or a channel is missing in the ``schemas``.
+    """
+    if stream not in schemas:
+        raise UsageError(
+            f"The model reads the stream {stream or 'of a single table'}, and there are {listed(schemas)}. Take the rig "
+            f"that the model was trained on."
+        )
+    recorded = {grid_name(stream, name) if synchronized else name: name for name in schemas[stream].names}
+    missing = [name for name in channels if name not in recorded]
     if missing:
-        raise UsageError(f"The stream {stream.stream} has no channel of {missing[0]}, which the model reads.")
-    return [recorded[name] for name in stream.channels]
+        raise UsageError(
+            f"The stream {stream} has no channel {missing[0]}, which the model reads. Take the rig that the model was "
+            f"trained on."
+        )
+    return [recorded[name] for name in channels]

@@ -1,129 +1,26 @@
 """Convert the blocks of a live session to predictions of a material model.
 
-A recording contains one slide, as for `tacpipe segment slides`, or, with a pause, several successive ones
-(`split_slides`). The current slide is classified several times per second from all samples so far. The last prediction
-of a slide, from all of its samples, is final.
+The current slide is classified several times per second from all samples so far.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
-from typing import ClassVar, NamedTuple
-
-import pyarrow as pa
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 from tacpipe.channels.streams import finger_stream
-from tacpipe.io import Json
-from tacpipe.live.decoding import BatchColumns, likely_schema
+from tacpipe.live.decoding import likely_schema
 from tacpipe.live.engine import SETTLE_NS
 from tacpipe.live.messages import Message
 from tacpipe.live.rows import RowEngine
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
-from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, SlideSplitter, rows_after, rows_until
+from tacpipe.tasks.material.live.slide import SlideSoFar
+from tacpipe.tasks.material.live.slides import SlideRow, SlidesSoFar
 
-GAP_NS = 50_000_000  # age of the finger's newest sample above which its stream counts as silent
-MAX_DURATION_NS = 120_000_000_000  # maximum duration of a recording, whose rows are in memory until it ends
 IDLE_NS = 20_000_000
-
-
-class SlideRow(NamedTuple):
-    """The prediction for a slide at a time."""
-
-    t_ns: int  # time up to which samples were read
-    answer: Answer
-    slide: int  # number of the slide in its recording, from 1
-    newest_ns: int  # arrival of the newest sample that was read; 0: there is none
-    is_final: bool
-
-
-class SlidesSoFar:
-    """The slides of a recording so far, each with a row whenever it is asked for and a final one."""
-
-    def __init__(
-        self, slide: SlideSoFar, streams: Collection[str], finger: str, pause_ns: int, beginning: Json | None
-    ) -> None:
-        """Start without samples. If ``pause_ns`` is 0, the recording is one slide.
-
-        A ``beginning`` is that of a recording whose earlier samples are lost, so that no material can be predicted.
-        """
-        self.streams, self.master, self.late = streams, finger, dict.fromkeys(streams, 0)
-        self._slide = slide
-        self._splitter = SlideSplitter(slide, finger, pause_ns) if pause_ns else None
-        self._number = 1 if beginning is None else int(beginning["slide"])
-        self._is_incomplete = beginning is not None
-        self._is_long = False
-        self._tables: dict[str, pa.Table] = {}
-        self._read_ns = 0  # end of the samples that were read
-
-    @property
-    def beginning(self) -> Json:
-        """The number of the slide; the samples are lost for other rows."""
-        return {"slide": self._number}
-
-    def push(self, stream: str, samples: BatchColumns) -> None:
-        """Add samples of a stream in the order of arrival."""
-        if self._is_incomplete or self._is_long:
-            return
-        table = samples.table()
-        self.late[stream] += int((table.column("t_ns").to_numpy() <= self._read_ns).sum())
-        stored = [self._tables[stream]] if stream in self._tables else []
-        self._tables[stream] = pa.concat_tables([*stored, table]).combine_chunks()
-
-    def take_over(self, previous: SlidesSoFar) -> None:
-        """Take nothing: the samples of earlier rows have a gap."""
-
-    def advance(self, until_ns: int | None) -> list[SlideRow]:
-        """Return the final rows of slides that ended by a time, and the row of the current slide.
-
-        None is the end of the recording, where that row is final as well.
-        """
-        last_ns = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
-        end_ns = int(max(last_ns, default=self._read_ns)) if until_ns is None else until_ns
-        rows = self._end_slides(end_ns)
-        if not rows or self.master in self._tables:  # otherwise the next slide has no samples yet
-            rows.append(self._row(end_ns, is_final=until_ns is None))
-        return rows
-
-    def _end_slides(self, until_ns: int) -> list[SlideRow]:
-        """Return the final rows of slides that ended by a time, and discard their samples."""
-        rows: list[SlideRow] = []
-        while self._splitter is not None and not self._is_long:
-            end_ns = self._splitter.end_ns(self._tables, until_ns)
-            if end_ns is None:
-                break
-            rows.append(self._row(end_ns, is_final=True))
-            self._tables = rows_after(self._tables, end_ns)
-            self._number += 1
-            self._splitter.begin()
-        return rows
-
-    def _row(self, until_ns: int, *, is_final: bool) -> SlideRow:
-        """Return the row of the current slide from its samples up to a time."""
-        streams = rows_until(self._tables, until_ns)
-        newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
-        silent_ns = 0 if is_final else until_ns - newest_ns.get(self.master, until_ns)
-        answer = self._answer(streams, silent_ns)
-        self._read_ns = max(self._read_ns, until_ns)
-        return SlideRow(until_ns, answer, self._number, max(newest_ns.values(), default=0), is_final)
-
-    def _answer(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
-        """Return the prediction for streams, or why there is none; the finger has been silent for ``silent_ns``."""
-        if self._is_incomplete:
-            return Answer(None)
-        if self.master not in streams:
-            return Answer(None, cause=f"nothing comes from {self.master}")
-        if silent_ns > GAP_NS:
-            return Answer(None, cause=f"nothing new comes from {self.master}")
-        t_ns = streams[self.master].column("t_ns")
-        self._is_long = self._is_long or t_ns[-1].as_py() - t_ns[0].as_py() > MAX_DURATION_NS
-        if self._is_long:
-            longest_s = MAX_DURATION_NS / 1e9
-            cause = f"the recording is longer than {longest_s:g} s; begin another one for the next slide"
-            return Answer(None, cause=cause)
-        return self._slide.answer(streams)
 
 
 class MaterialEngine(RowEngine[SlidesSoFar]):

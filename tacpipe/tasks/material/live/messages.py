@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.arrays import Float32s
 from tacpipe.io import JsonObject
 from tacpipe.live import messages
-from tacpipe.live.messages import VERSION, Sizes, head_values
+from tacpipe.live.messages import Sizes, head_values
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 WAITING, SLIDING, ENDED, FINAL = "waiting", "sliding", "ended", "final"  # states of a slide
@@ -145,12 +145,10 @@ class MaterialDescription(messages.Description):
         """Names of the materials."""
         return Sizes(self.channels)
 
-    def to_dict(self) -> JsonObject:
-        """Return the description as a dict for JSON and msgpack."""
+    @property
+    def details(self) -> JsonObject:
+        """What it states beside the kind of the messages."""
         return {
-            "version": VERSION,
-            "kind": "description",
-            "of": self.kind,
             "materials": list(self.channels),
             "sensor": self.sensor,
             "frames": self.frames,

@@ -7,26 +7,20 @@ differently: models that accept slides of any length read the available rows, on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Float32s
-from tacpipe.channels.streams import EVENTS, finger_stream
-from tacpipe.datasets.dataset import Dataset, Model, Recording
+from tacpipe.channels.streams import finger_stream
 from tacpipe.errors import TacpipeError
-from tacpipe.live.stages import RecordingInMemory, stage_params, streams_as_recorded
+from tacpipe.live.stages import RecordingInMemory, stage_params
 from tacpipe.plugins import registry
-from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.sensors.live import LATENCY
 from tacpipe.store.records import Step
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.evaluation import PREDICTIONS
-from tacpipe.tasks.material.live.messages import MATERIAL, MIN_SEEN
 from tacpipe.tasks.material.slides import STREAM, describe_difference
 
 if TYPE_CHECKING:
@@ -170,139 +164,3 @@ class SlideSoFar:
             return RecordingSoFar("so far", slide.streams, {**recording.attributes, **slide.attributes}), False
         remaining = table.slice(min(first, table.num_rows))
         return RecordingSoFar("so far", {STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
-
-
-MOMENT_NS = 100_000_000  # interval between checks of a part, starting at the finger's first sample
-
-
-class SlideSplitter:
-    """Detects the ends of slides in the samples of a part of a recording."""
-
-    def __init__(self, slide: SlideSoFar, finger: str, pause_ns: int) -> None:
-        """Store the slide definition, the finger's stream and the pause duration."""
-        self._slide, self._finger, self._pause_ns = slide, finger, pause_ns
-        self._moments = 0  # number of checks of this part
-
-    def begin(self) -> None:
-        """Start the next part."""
-        self._moments = 0
-
-    def end_ns(self, tables: Tables, until_ns: int) -> int | None:
-        """Return the time at which the slide of this part ended, or None if it has not ended by ``until_ns``.
-
-        ``tables`` contains the streams of this part, complete up to ``until_ns``.
-        """
-        if self._finger not in tables:
-            return None
-        first_ns = int(tables[self._finger].column("t_ns")[0].as_py())
-        while (at_ns := first_ns + (self._moments + 1) * MOMENT_NS) <= until_ns:
-            self._moments += 1
-            if self._slide.is_over(rows_until(tables, at_ns), self._finger, self._pause_ns):
-                return at_ns
-        return None
-
-
-def rows_until(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
-    """Return the rows of each stream up to a time; empty streams are omitted."""
-    return {name: tables[name].slice(0, count) for name, count in _counts(tables, t_ns).items() if count}
-
-
-def rows_after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
-    """Return the rows of each stream after a time; empty streams are omitted."""
-    counts = _counts(tables, t_ns)
-    return {name: tables[name].slice(count) for name, count in counts.items() if count < tables[name].num_rows}
-
-
-def _counts(tables: Tables, t_ns: int) -> dict[str, int]:
-    """Return the number of rows of each stream up to a time."""
-    return {
-        name: int(np.searchsorted(table.column("t_ns").to_numpy(), t_ns, "right")) for name, table in tables.items()
-    }
-
-
-def split_slides(
-    slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables
-) -> Iterator[tuple[int, dict[str, pa.Table]]]:
-    """Yield the end and the streams of each part of a recording; if ``pause_ns`` is 0, there is one part."""
-    remaining = {name: table for name, table in tables.items() if table.num_rows}
-    last_ns = max((int(table.column("t_ns")[-1].as_py()) for table in remaining.values()), default=0)
-    splitter = SlideSplitter(slide, finger, pause_ns)
-    was_split = False
-    while pause_ns and (end_ns := splitter.end_ns(remaining, last_ns)) is not None:
-        yield end_ns, rows_until(remaining, end_ns)
-        remaining, was_split = rows_after(remaining, end_ns), True
-        splitter.begin()
-    if finger in remaining or not was_split:
-        yield last_ns, remaining
-
-
-PAUSE_ATTR, LEAST_ATTR = "live_pause_s", "live_least"  # attributes with the settings of a session's recording
-UNREAD_STREAMS = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that sessions do not read
-Row = tuple[str, int, int, Answer]  # recording, index of the slide, end of the samples that were read, prediction
-
-
-def predict(model: Model, recordings: Dataset) -> Result:
-    """Return one table, ``predictions``, with one row per slide: index, end, rows, material, cause and probabilities.
-
-    ``recordings`` are raw. A recording is one slide or, if its session had a pause (attribute ``live_pause_s``),
-    several successive ones. Raises `TacpipeError` with the name of a recording that does not fit the model.
-    """
-    classifier = Classifier.load(model.files)
-    params = slide_params(model.source.chain)
-    rows: list[Row] = []
-    for name, recording in sorted(recordings.recordings.items()):
-        try:
-            rows += _slides(classifier, params, recording)
-        except TacpipeError as error:
-            raise type(error)(f"{name}: {error}") from error
-    return Result({PREDICTIONS: RecordingOutput(_table(classifier.names, rows))})
-
-
-def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
-    """Return the rows of a recording's slides, as a session with its settings predicted them.
-
-    Raises `TacpipeError` if its streams do not fit the model.
-    """
-    tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD_STREAMS}
-    attributes = recording.attributes
-    table = finger_stream(recording.name, tables)
-    stream = next(name for name, candidate in tables.items() if candidate is table)
-    sensor = str(
-        attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))
-    )
-    rate_hz = attributes.get("rate_hz")
-    least_seen = float(attributes.get(LEAST_ATTR) or MIN_SEEN)
-    slide = SlideSoFar(classifier, params, sensor, least_seen, float(rate_hz) if rate_hz else None)
-    pause_ns = round(float(attributes.get(PAUSE_ATTR) or 0.0) * 1e9)
-    numbered_parts = enumerate(split_slides(slide, stream, pause_ns, tables), start=1)
-    return [(recording.name, number, end_ns, slide.answer(part)) for number, (end_ns, part) in numbered_parts]
-
-
-def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
-    """Return the table of predictions, with a probability of each class in ``names``; "unknown" without a prediction."""
-    answers = [answer for *_, answer in rows]
-    probabilities = np.array(
-        [np.full(len(names), np.nan) if answer.probabilities is None else answer.probabilities for answer in answers],
-        np.float32,
-    ).reshape(len(rows), len(names))
-    metadata = {"quantity": "prediction"}
-    materials = [
-        "unknown" if answer.probabilities is None else names[int(answer.probabilities.argmax())] for answer in answers
-    ]
-    columns: list[tuple[pa.Field, Any]] = [
-        (pa.field("recording", pa.string()), [row[0] for row in rows]),
-        (pa.field("slide", pa.int32()), [row[1] for row in rows]),
-        (pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}), [row[2] for row in rows]),
-        (pa.field("rows", pa.int32()), [answer.rows for answer in answers]),
-        (pa.field("material", pa.string(), metadata=metadata), materials),
-        (pa.field("cause", pa.string()), [answer.cause for answer in answers]),
-        *(
-            (
-                pa.field(f"probability_{name}", pa.float32(), metadata={"quantity": "probability"}),
-                probabilities[:, number],
-            )
-            for number, name in enumerate(names)
-        ),
-    ]
-    arrays = [pa.array(values, field.type) for field, values in columns]
-    return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))

@@ -103,7 +103,7 @@ class MaterialLive(LiveTask):
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
         """Return the final prediction for each slide."""
-        from tacpipe.tasks.material.live.slide import predict
+        from tacpipe.tasks.material.live.slides import predict
 
         return predict(model, recordings)
 

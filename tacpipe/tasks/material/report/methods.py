@@ -10,11 +10,12 @@ import pandas as pd
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import Kind, Question, Settings
 from tacpipe.datasets.dataset import Dataset
+from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.headline import MaterialMetrics, sensor_title
-from tacpipe.tasks.material.params import MaterialConfig, kind_of
+from tacpipe.tasks.material.params import MaterialConfig, Params
 from tacpipe.tasks.material.report import predictions
 
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that names do not mark
@@ -111,7 +112,7 @@ def runs_on(method: Method, sensor: str) -> list[ComparedRun]:
 def base_name(settings: Settings, variants: bool = True) -> str:
     """Return the base name of a method, without suffixes that distinguish it from similar ones."""
     architecture = str(settings["architecture"])
-    kind = kind_of(architecture)
+    kind = architectures.find_or(Params, architecture)
     name = kind.TITLE or architecture
     if settings["frozen_sensor"]:
         name = "mapping to known space"

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from tacpipe.io import Json
 from tacpipe.live import messages
-from tacpipe.live.messages import VERSION, Sizes, head_values
+from tacpipe.live.messages import Sizes, head_values
 from tacpipe.sensors.live import LSL, OFF, ON, UNKNOWN, Declaration, LiveColumn, MessageSizes, Value, latency_values
 
 SLIP = "slip"  # the recorded stream
@@ -103,11 +103,10 @@ class SlipDescription(messages.Description):
         """No lists: each message has one probability."""
         return Sizes()
 
-    def to_dict(self) -> Json:
-        """Return the description as JSON and msgpack hold it."""
+    @property
+    def details(self) -> Json:
+        """What it states beside the kind of the messages."""
         return {
-            "version": VERSION,
-            "kind": "description",
             "model": self.model,
             "rate_hz": self.rate_hz,
             "horizon_s": self.horizon_s,

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import UsageError
 from tacpipe.live.settings import LiveTask, SessionPlan, Settings, TaskSettings
 from tacpipe.plugins.constraints import Range
 from tacpipe.plugins.stage import Attribute, Result
-from tacpipe.printable import listed
 from tacpipe.sensors.live import Declaration
 from tacpipe.sensors.plan import MEASURED
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.learning.live.task import require_inputs, require_stages
 from tacpipe.tasks.slip.live.messages import DECLARATION, SLIP, SlipDescription
 
 if TYPE_CHECKING:
@@ -54,21 +54,9 @@ class SlipLive(LiveTask):
         config = model_files.tree(
             model.files, model_files.CONFIG, {"inputs": list, "calibration.levels": dict, "params": dict}
         )
-        _require_recorded(model)
+        require_stages(model.source.chain)
         _level_name(config["calibration"]["levels"], own.alarms_per_minute)
-        for finger in config["inputs"]:
-            if finger["stream"] not in rig.streams:
-                raise UsageError(
-                    f"The model reads the stream {finger['stream']}, and the rig has {listed(rig.streams)}. Take the "
-                    f"rig that the model was trained on."
-                )
-            channels = [field.name for field in rig.streams[finger["stream"]].sensor.fields()]
-            missing = sorted(set(finger["channels"]) - set(channels))
-            if missing:
-                raise UsageError(
-                    f"The stream {finger['stream']} of this rig has no channel {missing[0]}, which the model reads. Take "
-                    f"the rig that the model was trained on."
-                )
+        require_inputs(config, model.source.chain, rig)
         with settings.naming("plan"):
             planned = plans.with_plan(rig, own.plan, own.plan_from)
         if config["params"].get("actions") == "planned" and PLAN not in planned.streams:
@@ -102,7 +90,7 @@ class SlipLive(LiveTask):
         """Return the probabilities that a session would publish for recordings."""
         from tacpipe.tasks.slip.model import predict
 
-        _require_recorded(model)
+        require_stages(model.source.chain)
         return predict(model.files, recordings)
 
     def evaluate(self, model: Model, recordings: Dataset) -> Result:
@@ -115,17 +103,6 @@ class SlipLive(LiveTask):
 def _own(settings: Settings) -> SlipSettings:
     assert isinstance(settings.task, SlipSettings)
     return settings.task
-
-
-def _require_recorded(model: Model) -> None:
-    """Raise `TacpipeError` if a model was trained on the output of a stage, which a session does not run."""
-    steps = [step["stage"] for step in model.source.chain]
-    if steps:
-        raise TacpipeError(
-            f"The model was trained on the output of `tacpipe {steps[0].replace('.', ' ')}`, and a session reads "
-            f"samples as they are recorded. Train it on recordings, with slips labelled by "
-            "`tacpipe label RECORDINGS --interval slip FROM TO`."
-        )
 
 
 def _level_name(levels: Mapping[str, float], per_minute: float) -> str:

@@ -13,7 +13,7 @@ from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.channels import biotac_sp
 from tacpipe.io import JsonObject
 from tacpipe.live import messages
-from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
+from tacpipe.live.messages import Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Declaration, LiveColumn, Value, latency_values
 
 COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # values of a reading
@@ -177,12 +177,10 @@ class TouchDescription(messages.Description):
         """Names of the predicted values."""
         return Sizes(COLUMNS)
 
-    def to_dict(self) -> JsonObject:
-        """Return the description as a dict for JSON and msgpack."""
+    @property
+    def details(self) -> JsonObject:
+        """What it states beside the kind of the messages."""
         return {
-            "version": VERSION,
-            "kind": "description",
-            "of": self.kind,
             "targets": list(self.targets),
             "unit": "count",
             "criterion": self.criterion,

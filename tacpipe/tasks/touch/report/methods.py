@@ -15,12 +15,13 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison import runs
 from tacpipe.comparison.runs import Question, Settings
 from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.headline import GRASPS, MODEL, PREDICTIONS, TRUE
-from tacpipe.tasks.touch.params import DEFAULT, PAPER, TouchConfig, kind_of
+from tacpipe.tasks.touch.params import DEFAULT, PAPER, Params, TouchConfig
 
 USUAL = ("split", "simulated", "colour", SHORTENED)  # settings that are part of the question or of the first name
 _NO_METHOD = ("seed", "run_label", "baselines")  # may differ between runs of one method; the label is shown as split
@@ -138,7 +139,9 @@ class TouchResult(context.ReportResult[TouchConfig]):
     def name(self) -> str:
         """Name of its method, with its inputs and a shortened schedule; settings that differ follow it."""
         coloured = bool(self.settings.get("colour", True))
-        name, *inputs = kind_of(self.architecture).report_names(self.architecture, coloured=coloured)
+        name, *inputs = architectures.find_or(Params, self.architecture).report_names(
+            self.architecture, coloured=coloured
+        )
         shortened = self.settings.get(SHORTENED)
         return " · ".join([f"{name} ({shortened})" if shortened else name, *inputs])
 
@@ -205,7 +208,7 @@ def _run(run: TouchResult, splits: Sequence[tuple[str, bool]]) -> ComparedRun:
         run.name,
         run.settings,
         questions,
-        family=kind_of(run.architecture).TITLE or run.architecture,
+        family=architectures.find_or(Params, run.architecture).TITLE or run.architecture,
         seed=run.params.get("seed"),
         published=run.published,
         details=run,

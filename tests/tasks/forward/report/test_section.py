@@ -189,15 +189,3 @@ def test_a_forecast_is_drawn_when_it_is_for_in_a_window_around_the_steepest_chan
     assert rows["persistence of 10 rows before", 3.18] == 0 and rows["persistence of 10 rows before", 3.2] == 100
     times = [x for _, x in rows]
     assert max(times) - min(times) == pytest.approx(12 * 0.2, abs=0.05)  # twelve horizons of ten rows
-
-
-def test_live_sessions_have_errors_rows_and_latency_and_other_results_have_none() -> None:
-    live = {"mae": {"live": {"t1": 2.5}}, "rows": {"published": 1500, "equal": 1419}, "latency": {"p99_ms": 8.5}}
-    plain = result("raw")
-    tree = {**json.loads(plain.files["metrics.json"]), "live": live}
-    with_live = FakeDataset(
-        plain.recordings, {**plain.files, "metrics.json": json.dumps(tree).encode()}, plain.manifest
-    )
-    (table,) = parts.tables([parts.folds(forward(with_live))["Live sessions"]])
-    assert parts.cells(table, "mae, live, t1") == ["2.5"] and parts.cells(table, "latency, p99_ms") == ["8.5"]
-    assert "Live sessions" not in parts.folds(forward(plain))
