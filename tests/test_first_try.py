@@ -91,3 +91,14 @@ def test_what_is_learned_follows_from_labels_and_quantities(
     stated = {"object": labels * 4} if any(labels) else {}
     commands = first_try.commands_after(publish(lab, "r", dict.fromkeys(names, streams), **stated), Path("out"))
     assert [" ".join(words[: 2 if words[0] == "train" else 1]) for words in commands] == expected
+
+
+def test_open_shows_the_page_in_a_browser_and_no_folder(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    page = lab.folder / "report.html"
+    page.touch()
+    for shown in (page, lab.folder):
+        monkeypatch.setattr("tacpipe.cli.first_try.run", lambda folder, output, shown=shown: shown)
+        assert lab.run("try lab --open").out.strip() == str(shown)
+    assert opened == [page.as_uri()]

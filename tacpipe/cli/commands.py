@@ -19,6 +19,7 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Opens = Annotated[bool, typer.Option("--open", help="Open the report in a browser.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
     "live": "Predict while a rig is recorded.",
@@ -209,10 +210,11 @@ def _add_demo(program: typer.Typer) -> None:
             Path | None,
             typer.Option("--rig", help="Rig file: replay simulated trials as this rig, and record them."),
         ] = None,
+        opens: Opens = False,
     ) -> None:
         from tacpipe.cli import demo as demonstration
 
-        terminal.result(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig))
+        _show_page(demonstration.run(output) if rig is None else demonstration.run_rig(output, rig), opens=opens)
 
 
 def _add_try(program: typer.Typer) -> None:
@@ -228,10 +230,11 @@ def _add_try(program: typer.Typer) -> None:
     def try_folder(
         folder: Annotated[Path, typer.Argument(help="Folder with recordings, in any format that ingest reads.")],
         output: Annotated[Path, typer.Option("-o", "--output", help="Directory to write.")] = Path("try"),
+        opens: Opens = False,
     ) -> None:
         from tacpipe.cli import first_try
 
-        terminal.result(first_try.run(folder, output))
+        _show_page(first_try.run(folder, output), opens=opens)
 
 
 def _add_version(program: typer.Typer) -> None:
@@ -251,6 +254,15 @@ def _from_module(name: str) -> Callable[[typer.Typer], None]:
         importlib.import_module(f"tacpipe.cli.{name}").add(program, SUMMARIES.get(name) or registry.group_help(name))
 
     return add
+
+
+def _show_page(page: Path, *, opens: bool) -> None:
+    """Print the path of a page, and open it in a browser if it ``opens``."""
+    terminal.result(page)
+    if opens and page.is_file():
+        import webbrowser
+
+        webbrowser.open(page.resolve().as_uri())
 
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:

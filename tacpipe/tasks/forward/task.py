@@ -117,7 +117,7 @@ def chain(output: Path) -> list[list[str]]:
     return [
         ["synchronize", paths["recordings"], "-o", paths["synced"]],
         ["segment", "contacts", paths["synced"], "-o", paths["segments"]],
-        ["split", paths["segments"], "-o", paths["split"], "--scheme", "random"],
+        ["split", paths["segments"], "-o", paths["split"], "--scheme", "random", "--test", "0.25"],
         ["train", "forward", paths["segments"], *split, "-o", paths["model"], "--epochs", "6", "--stride", "2"],
         ["evaluate", paths["model"], paths["segments"], *split, "-o", paths["results"]],
     ]
