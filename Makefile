@@ -74,6 +74,7 @@ docs: $(VENV)/.docs ## build the documentation as a site into .cache/site
 
 pictures: demo #- draw the pictures of the documentation, that of the front page from the demo's report
 	@$(BIN)/python docs/pictures.py demo/report.html
+	@$(BIN)/python docs/moving_picture.py .cache/slip
 
 benchmark: $(VENV)/.dev #- measure every published set in DATA next to the numbers of its paper, in days; OPTIONS=--quick takes minutes
 	@$(BIN)/python benchmarks/published.py $(DATA) $(OPTIONS)

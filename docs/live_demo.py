@@ -60,15 +60,15 @@ def run(output: Path, rig_file: Path, seed: int = 0) -> Path:
 
     Raises `TacpipeError` if a command fails.
     """
-    _train(output, seed)
+    train(output, seed)
     (port,) = free_ports(1)
     replayed = output / "replayed"
-    _simulate(SEED, REPLAYED, replayed)
+    simulate(SEED, REPLAYED, replayed)
     with ReplayEmulator(rigs.read(rig_file), tacpipe.open(replayed), output / "emulated", IDLE_S) as emulator:
         rig, model = str(output / "emulated" / "rig.toml"), str(output / "model")
         Path(rig).write_text(rigs.to_toml(emulator.rig))
         with send_plans(poses_of(emulator.replay), emulator.epoch_ns, port, PLAN_RATE_HZ):
-            _tacpipe(
+            run_tacpipe(
                 *("live", rig, "--model", model, "-o", str(output / "live"), "--plan", f"udp:127.0.0.1:{port}"),
                 *("--duration-s", f"{IDLE_S + LIVE_S:g}", "--alarms-per-minute", PER_MINUTE),
             )
@@ -83,23 +83,24 @@ def poses_of(replay: Replay) -> Callable[[Times], Floats]:
     return lambda t_ns: np.column_stack([np.interp(t_ns, times, pose) for pose in poses])
 
 
-def _train(output: Path, seed: int) -> None:
+def train(output: Path, seed: int) -> None:
     """Simulate trials and train on them; stored results are reused."""
     recordings, split = str(output / "recordings"), str(output / "split")
-    _simulate(TRAINING_SEED, ("--trials", str(TRIALS), "--plan-rate-hz", f"{PLAN_RATE_HZ:g}"), output / "recordings")
-    _tacpipe("split", recordings, "-o", split, "--scheme", "random", *VALIDATION, "--seed", str(seed))
+    simulate(TRAINING_SEED, ("--trials", str(TRIALS), "--plan-rate-hz", f"{PLAN_RATE_HZ:g}"), output / "recordings")
+    run_tacpipe("split", recordings, "-o", split, "--scheme", "random", *VALIDATION, "--seed", str(seed))
     params = (*TRAINING, "--seed", str(seed))
-    _tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *params, "--quiet")
+    run_tacpipe("train", "slip", recordings, "--split", split, "-o", str(output / "model"), *params, "--quiet")
 
 
-def _simulate(seed: int, options: Sequence[str], output: Path) -> None:
+def simulate(seed: int, options: Sequence[str], output: Path) -> None:
     """Simulate trials that slip because of their plan."""
-    _tacpipe(
+    run_tacpipe(
         *("simulate", "forward", "--seed", str(seed), "--effort", str(EFFORT), *options, "-o", str(output), "--quiet")
     )
 
 
-def _tacpipe(*words: str) -> None:
+def run_tacpipe(*words: str) -> None:
+    """Print a command of tacpipe and run it. Raises `TacpipeError` if it fails."""
     terminal.note("$ tacpipe " + " ".join(words))
     code = subprocess.run(
         [sys.executable, "-P", "-m", "tacpipe", *words], stdout=subprocess.DEVNULL, check=False
