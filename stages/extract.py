@@ -19,6 +19,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import registry
 from tacpipe.plugins.constraints import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seed, Unit
 from tacpipe.plugins.file_params import pin_file
+from tacpipe.plugins.params import added
 from tacpipe.plugins.rows import RowCounts, count_rows
 from tacpipe.plugins.stage import Fitted, RecordingOutput, Result, Workspace, stage
 from tacpipe.plugins.stream_selection import StreamSelection
@@ -179,6 +180,8 @@ class FrameAutoencoderParams(StreamSelection):
     learning_rate: PositiveFloat = 1e-3  # learning rate of Adam
     patience: PositiveInt = 5  # epochs without a lower error on held-out training recordings before training stops
     seed: Seed = 0  # random seed of initial weights and of the order of images
+    # number of first frames whose mean, the untouched gel, is subtracted from each image; 0: images as they are
+    reference_frames: NonNegativeInt = added(0)
 
 
 @stage(version=2)
@@ -196,7 +199,7 @@ def fit_autoencoder(params: FrameAutoencoderParams, train: Dataset, workspace: W
             f"An autoencoder is stopped by recordings that it does not learn, so it needs at least 2 training recordings "
             f"and there are {len(recordings)}. Make a split with more."
         )
-    images = _training_images(recordings, params.images)
+    images = _training_images(recordings, params.images, params.reference_frames)
     schedule = Schedule(
         epochs=params.epochs,
         batch=params.batch,
@@ -224,9 +227,7 @@ def autoencoder(
     from tacpipe.codecs import frame_autoencoder
 
     encode = frame_autoencoder.read_encoder(codec[frame_autoencoder.WEIGHTS])
-    return _replace_frames(
-        recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
-    )
+    return _encode_frames(recording, encode, params.reference_frames)
 
 
 @dataclass(frozen=True)
@@ -236,6 +237,8 @@ class EncoderParams(StreamSelection):
     encoder: str = "autoencoder"  # name of an encoder; plug-ins can add more
     weights: str = ""  # file with the encoder's weights
     weights_sha256: str = ""  # sha256 of that file; computed if omitted
+    # number of first frames whose mean, the untouched gel, is subtracted from each image; 0: images as they are
+    reference_frames: NonNegativeInt = added(0)
 
     def __post_init__(self) -> None:
         """Compute the digest of the weights, which is part of the key. Raises the errors of `pin_file`."""
@@ -255,9 +258,41 @@ def encoder(params: EncoderParams, recording: Recording) -> RecordingOutput:
     if not params.weights:
         raise UsageError("weights names no file. Give the file with the weights of the encoder.")
     encode = registry.load_encoder(params.encoder)(Path(params.weights))
-    return _replace_frames(
-        recording, lambda place, columns, video_format: _feature_stream(columns, video_format, encode)
-    )
+    return _encode_frames(recording, encode, params.reference_frames)
+
+
+def _encode_frames(recording: Recording, encode: Encode, reference_frames: int) -> RecordingOutput:
+    """Return a recording with its frames replaced by their features."""
+
+    def compute(place: str, columns: Columns, video_format: VideoFormat) -> pa.RecordBatchReader:
+        return _feature_stream(columns, _images(columns, video_format, reference_frames, place), encode)
+
+    return _replace_frames(recording, compute)
+
+
+def _images(
+    columns: Columns, video_format: VideoFormat, reference_frames: int, place: str
+) -> Iterator[tuple[int, Bytes | None]]:
+    """Yield row number and image of each frame; with ``reference_frames``, minus the untouched gel, around 128.
+
+    The untouched gel is the mean of the first frames up to the row, so no row looks ahead. Differences beyond 127 grey
+    levels are cut off. ``place`` names the stream in errors.
+    """
+    from tacpipe.video.channels import UntouchedGel
+    from tacpipe.video.decoding import decode_frames, read_batches
+
+    frames = decode_frames(video_format, read_batches(columns))
+    if not reference_frames:
+        yield from frames
+        return
+    untouched = UntouchedGel(reference_frames, place)
+    for row, image in frames:
+        if image is None:
+            untouched.skip()
+            yield row, None
+        else:
+            difference = np.rint(image - untouched.update(image.astype(np.float32)))
+            yield row, np.clip(difference + 128, 0, 255).astype(np.uint8)
 
 
 def _replace_frames(
@@ -384,13 +419,12 @@ def _blocks(values: Iterator[tuple[int, T]], rows: int) -> Iterator[list[tuple[i
         yield block
 
 
-def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]:
+def _training_images(recordings: Sequence[Recording], count: int, reference_frames: int) -> list[Bytes]:
     """Return about ``count`` downscaled images from all streams of frames, by recording (image, row, column, rgb).
 
-    Raises `TacpipeError` if there are no frames.
+    They are those of `_images`. Raises `TacpipeError` if there are no frames.
     """
     from tacpipe.codecs.frame_autoencoder import reduce_image
-    from tacpipe.video.decoding import decode_frames, read_batches
     from tacpipe.video.stream import read_format
 
     streams: list[list[tuple[str, Columns, VideoFormat]]] = []  # by recording
@@ -406,7 +440,8 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
     for recording, frame_streams in zip(recordings, streams, strict=True):
         reduced: list[Bytes] = []
         for stream, columns, video_format in frame_streams:
-            frames, before = decode_frames(video_format, read_batches(columns)), len(reduced)
+            place, before = f"Recording {recording.name}, stream {stream}", len(reduced)
+            frames = _images(columns, video_format, reference_frames, place)
             reduced += [reduce_image(image) for row, image in frames if row % step == 0 and image is not None]
             counts = RowCounts.some_used(columns.num_rows, len(reduced) - before, "not sampled or damaged")
             count_rows(recording.name, stream, counts)
@@ -415,15 +450,17 @@ def _training_images(recordings: Sequence[Recording], count: int) -> list[Bytes]
     return images
 
 
-def _feature_stream(columns: Columns, video_format: VideoFormat, encode: Encode) -> pa.RecordBatchReader:
+def _feature_stream(
+    columns: Columns, images_by_row: Iterator[tuple[int, Bytes | None]], encode: Encode
+) -> pa.RecordBatchReader:
     """Return a stream of the features of frames, with their clocks. The first batch determines the number of features.
 
-    Raises `TacpipeError`, here or while the stream is read, if the encoder returns an array of the wrong shape.
+    ``images_by_row`` has row number and image of each frame, or None for a damaged one. Raises `TacpipeError`, here or
+    while the stream is read, if the encoder returns an array of the wrong shape.
     """
-    from tacpipe.video.decoding import decode_frames, read_batches
 
     def features() -> Iterator[tuple[int, AnyFloats | None]]:
-        for block in _blocks(decode_frames(video_format, read_batches(columns)), ENCODED_FRAMES):
+        for block in _blocks(images_by_row, ENCODED_FRAMES):
             images = [image for _, image in block if image is not None]
             if not images:
                 yield from ((row, None) for row, _ in block)

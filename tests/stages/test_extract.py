@@ -257,6 +257,13 @@ def test_an_encoder_gives_a_frame_the_same_features_whatever_follows_it(
     assert np.array_equal(np.column_stack([features.column(f"feature{n:02d}").to_numpy() for n in (1, 2, 3)]), expected)
     part = extract({"gel": frames.slice(0, 33)}, "extract.encoder", weights=str(weights), encoder="corner")["gel"]
     assert part.equals(features.slice(0, 33))
+
+    options = {"weights": str(weights), "encoder": "corner", "reference_frames": 2}
+    changes = extract({"gel": frames}, "extract.encoder", **options)["gel"]
+    corners = np.array([image.reshape(-1)[:3] for image in images], np.float64)
+    untouched = np.array([corners[: min(row + 1, 2)].mean(axis=0) for row in range(len(corners))])
+    expected = np.clip(np.rint(corners - untouched) + 128, 0, 255) + 32
+    assert np.array_equal(np.column_stack([changes.column(f"feature{n:02d}").to_numpy() for n in (1, 2, 3)]), expected)
     forget()
 
 
