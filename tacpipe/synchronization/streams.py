@@ -23,6 +23,7 @@ from tacpipe.signals.repairs import HALF, RANGE, count_wraps
 from tacpipe.signals.resampling import expect_grid_of_samples, uniform_offsets
 from tacpipe.signals.sampling import spread_times
 from tacpipe.synchronization.placement import Placement, are_arrivals
+from tacpipe.video.stream import PACKET
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
@@ -352,7 +353,7 @@ def _repeated_rows(columns: Columns | SelectedRows, storage: MappedArrays) -> Bo
 def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> str:
     """Return the name of the stream that defines the grid: ``requested``, or the first with a tactile channel.
 
-    Raises `TacpipeError` if there is none.
+    If all are streams of frames, it is the first. Raises `TacpipeError` if there is none.
     """
     if requested:
         if requested not in schemas:
@@ -363,6 +364,8 @@ def master(recording: str, requested: str, schemas: Mapping[str, pa.Schema]) -> 
     for name, schema in schemas.items():
         if any((field.metadata or {}).get(b"quantity") == b"tactile" for field in schema):
             return name
+    if schemas and all(PACKET in schema.names for schema in schemas.values()):
+        return next(iter(schemas))
     reason = missing_channel_error(recording, "tactile", schemas)
     raise TacpipeError(f"{reason} Or choose the master with --master: {join_names(schemas)}.")
 

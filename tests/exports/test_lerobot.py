@@ -222,7 +222,7 @@ def test_h5py_reads_decoded_frames(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
     assert "images belongs to --structure streams" in refused.err
 
 
-LEROBOT = "export lerobot rec -o lr --rate-hz 25 --master gel"
+LEROBOT = "export lerobot rec -o lr --rate-hz 25"
 VIDEO = "lr/videos/observation.images.gel/chunk-000/file-000.mp4"
 
 
@@ -292,7 +292,7 @@ def test_zarr_arrays_have_the_nearest_frame_of_each_row(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, rate_hz: int
 ) -> None:
     path = write(lab, "mpeg4", "avi", monkeypatch, b_frames=2)
-    lab.run(f"export zarr rec -o zarr --rate-hz {rate_hz} --master gel --images")
+    lab.run(f"export zarr rec -o zarr --rate-hz {rate_hz} --images")
     store: Any = zarr.open("zarr/replay.zarr", mode="r")
     images = store["data/gel_rgb"][:]
     rows = [round(number * 25 / rate_hz - 1e-9) for number in range(len(images))]

@@ -74,7 +74,7 @@ def test_lerobot_s_loader_decodes_the_nearest_frame_of_each_row(lab: Lab) -> Non
         path = videos.write(lab.folder / f"{name}.{ending}", encoder, 40)
         frames[name] = np.array(videos.decoded(path), int)
     write_dataset(lab.folder / "rec", {name: ({"gel": frames_of(lab.folder / f"{name}.avi")}, {}) for name in frames})
-    lab.run("export lerobot rec -o lr --rate-hz 25 --master gel --no-originals")
+    lab.run("export lerobot rec -o lr --rate-hz 25 --no-originals")
     result = read("lerobot_video", "lr")
     assert result["frames"] == 80
     for row, pixels in zip(result["rows"], result["images"], strict=True):
