@@ -28,6 +28,7 @@ MODULES = (
     "synchronization",
     "held_trials",
     "decode",
+    "frames",
     "forward_training",
     "material_training",
     "ingestion",
