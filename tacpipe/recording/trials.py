@@ -23,6 +23,7 @@ from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, sealing, spool_folders, triggers
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.appending import NothingError
+from tacpipe.recording.disk import DiskForecast
 from tacpipe.recording.losses import StreamLosses
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
@@ -190,8 +191,13 @@ def _record_trial(
     advice = f"The recorded data is in {spool.folder}; `tacpipe acquire --recover` seals it"
     # The spool stays locked until it is sealed, so that no other process recovers it.
     with termination.reporting(f"tacpipe: interrupted. {advice}."), contextlib.closing(spool):
+        disk = DiskForecast(spool.folder)
+
+        def show() -> None:
+            view.show(f"recording {name}, {clock.now_s() - start_s:.0f} s", disk.warning())
+
         with recorder.recording(spool, preroll=plan.start != "now"):
-            recorder.run(is_over, lambda: view.show(f"recording {name}, {clock.now_s() - start_s:.0f} s"))
+            recorder.run(is_over, show)
             spool.note(StreamNote(clock.now_ns(), "", ENDED, ending))
         lost = recorder.lost()  # before sealing, because nothing is read during it
         view.show(f"sealing {name}")

@@ -172,10 +172,13 @@ class RigView:
             yield self
         self._live = None
 
-    def show(self, state: str) -> None:
-        """Show the figures of the streams, ``state``, a description of the rig's activity, and a line for each new event."""
+    def show(self, state: str, warning: str = "") -> None:
+        """Show the figures of the streams, ``state``, a description of the rig's activity, and a line for each new event.
+
+        A ``warning`` is an event of this moment.
+        """
         now_s = clock.now_s()
-        for event in [] if self._quiet else self._new_events():
+        for event in [] if self._quiet else self._new_events(warning):
             if self._live is not None:
                 self._live.console.print(printable.shown(event), markup=False, highlight=False, soft_wrap=True)
             else:
@@ -192,10 +195,10 @@ class RigView:
             for footer_line in self._footer():
                 terminal.note(footer_line)
 
-    def _new_events(self) -> list[str]:
+    def _new_events(self, warning: str) -> list[str]:
         """Return a line with the time of day for each event since the last call: a loss, a silence, dropped data."""
-        events = []
         now_ns = clock.now_ns()
+        events = [(now_ns, warning)]
         for name, watch in self._watches.items():
             while watch.notes:
                 note = watch.notes.popleft()

@@ -241,3 +241,8 @@ def test_a_rig_without_a_camera_is_refused() -> None:
 def test_without_the_option_nothing_is_served(camera: Watch) -> None:
     with serve_pictures({"gel": camera}, None) as page:
         assert page == ""
+
+
+def test_a_warning_is_a_line_with_its_time(force: Watch, capsys: pytest.CaptureFixture[str]) -> None:
+    RigView({"force": force}).show("recording a", "The disk has room for 9 minutes more.")
+    assert re.search(r"^\d\d:\d\d:\d\d The disk has room for 9 minutes more\.$", capsys.readouterr().err, re.MULTILINE)
