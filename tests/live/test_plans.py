@@ -74,7 +74,8 @@ def planner(scheme: str) -> Iterator[tuple[str, threading.Event]]:
                 connection.send(packet().decode())
             is_over.wait()
 
-    with serve(answer, "127.0.0.1", port) as server:
+    with serve(answer, "127.0.0.1", 0) as server:
+        port = server.socket.getsockname()[1]
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -73,5 +73,6 @@ def test_the_windows_are_those_that_a_look_at_every_start_finds(
 
 
 def test_a_window_without_length_is_refused() -> None:
-    with pytest.raises(TacpipeError, match="horizon 0"):
-        window_starts(np.zeros(3), np.ones(3, dtype=bool), 1, 0)
+    for context, horizon in ((0, 1), (1, -1)):
+        with pytest.raises(TacpipeError, match=f"context {context}, horizon {horizon}"):
+            window_starts(np.zeros(3), np.ones(3, dtype=bool), context, horizon)
