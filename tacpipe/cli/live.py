@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from tacpipe.live.session import Supervisor
     from tacpipe.recording import trials as trials_of
     from tacpipe.recording.recorder import Recorder
+    from tacpipe.recording.rig import Rig
 
 SCHEMA_VERSION = 1
 REPEATED = ("publish",)  # settings whose option may be repeated, once per item
@@ -43,7 +46,9 @@ Example: tacpipe live rig.toml --model models/calibrated --quantiles 10,90   # f
 
 Example: tacpipe live rig.toml --model models/forward --realtime   # on a busy computer
 
-Example: tacpipe live rig.toml --model models/slip --plan udp::9000 --alarms-per-minute 1"""
+Example: tacpipe live rig.toml --model models/slip --plan udp::9000 --alarms-per-minute 1
+
+Example: tacpipe live --replay data/recordings --model models/forward --publish ws:127.0.0.1:8765"""
 
 
 def add(program: typer.Typer, summary: str) -> None:
@@ -53,7 +58,10 @@ def add(program: typer.Typer, summary: str) -> None:
     """
 
     def live(
-        rig: Annotated[Path, typer.Argument(help="Rig file, as for `tacpipe acquire`.")],
+        rig: Annotated[Path | None, typer.Argument(help="Rig file, as for `tacpipe acquire`.")] = None,
+        replay: Annotated[
+            Path | None, typer.Option("--replay", help="Recordings that are replayed in place of a rig.")
+        ] = None,
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
         duration: Annotated[
             float | None, typer.Option("--duration-s", help="Duration of the session, s; without it until Ctrl-C.")
@@ -75,8 +83,12 @@ def add(program: typer.Typer, summary: str) -> None:
         if duration is not None and duration <= 0:
             raise UsageError("--duration-s must be above 0.")
         option_texts = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-        session = preparation.prepare(rigs.read(rig), str(rig), option_texts)
-        _run(session, output, name, duration, label or [], pictures, quiet=quiet, as_json=as_json)
+        source = rig or replay
+        if source is None or (rig and replay):
+            raise UsageError("Give a rig file, or --replay with recordings that are replayed in its place.")
+        with _replayed(source) if replay else contextlib.nullcontext(rigs.read(source)) as parsed_rig:
+            session = preparation.prepare(parsed_rig, str(source), option_texts)
+            _run(session, output, name, duration, label or [], pictures, quiet=quiet, as_json=as_json)
 
     signature = inspect.signature(live, eval_str=True)
     common_parameters = [
@@ -89,6 +101,18 @@ def add(program: typer.Typer, summary: str) -> None:
     function.__signature__ = full_signature  # Typer reads both the signature and the annotations.
     function.__annotations__ = {name: parameter.annotation for name, parameter in full_signature.parameters.items()}
     program.command("live", help=summary + HELP)(live)
+
+
+@contextlib.contextmanager
+def _replayed(path: Path) -> Iterator[Rig]:
+    """Yield a rig that sends the recordings at ``path`` again and again during the block."""
+    import tacpipe
+    from tacpipe.simulation.emulation.emulator import ReplayEmulator
+    from tacpipe.simulation.emulation.replay import rig_of
+
+    recordings = tacpipe.open(path)
+    with ReplayEmulator(rig_of(recordings[0]), recordings) as emulator:
+        yield emulator.rig
 
 
 def _options() -> list[inspect.Parameter]:

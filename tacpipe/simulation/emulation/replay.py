@@ -6,6 +6,7 @@ Recordings follow one another and start again after the last one. Counters and c
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,12 +15,14 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Int64s
+from tacpipe.channels.schema import is_truth
+from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.plugins import params
-from tacpipe.recording.rig import Rig, RigStream, build_sensor
+from tacpipe.recording.rig import Rig, RigStream, build_sensor, to_toml
 from tacpipe.sensors.encoding import split_frames, value_blocks
-from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.sensor import Samples, Sensor, numbered_names
 from tacpipe.video.stream import read_format
 
 if TYPE_CHECKING:
@@ -36,6 +39,7 @@ REFUSED = {  # sensors that cannot be replayed, and the reason
     "clouds": "a recorded cloud has one row per point; copy the files of the clouds to the folder instead",
     "plan": "plans are for times that are over; remove the stream",
 }
+_ELEMENT = re.compile(r"(.*?)(\d+)?(?:_([a-z]))?")  # stem, number and axis of an array's column
 STAMPS = {"seq": "u32", "t_device_ns": "i64"}  # recorded counter and clock, and their types in frames of generic
 ARRIVAL, DEVICE_COUNTER = "t_ns", "device_seq"
 SUM = "sum_of_frame"  # number of the checksum in frames of generic
@@ -216,7 +220,12 @@ def _sendable(stream: RigStream, recorded: Columns) -> RigStream:
     if stream.kind in REFUSED:
         raise UsageError(f"{stream.name}: {stream.kind} cannot be replayed, because {REFUSED[stream.kind]}.")
     if stream.address.scheme not in LINKS or waits_for_requests(stream.sensor):
-        return _as_generic(stream, recorded)
+        if texts := _not_numbers(recorded):
+            raise UsageError(
+                f"{stream.name}: {stream.kind} cannot be emulated on {stream.address.scheme}, and its column {texts[0]} is "
+                "not a number that generic could send instead; remove the stream."
+            )
+        return _as_generic(stream.name, recorded, stream.sensor.rate_hz, stream.sensor.step)
     missing = [field.name for field in stream.sensor.fields() if field.name not in recorded.column_names]
     if missing:
         raise UsageError(
@@ -231,32 +240,85 @@ def _sendable(stream: RigStream, recorded: Columns) -> RigStream:
     return stream
 
 
-def _as_generic(stream: RigStream, recorded: Columns) -> RigStream:
-    """Return a stream that sends the recorded columns as frames of the sensor ``generic``.
+def rig_of(recording: Recording) -> Rig:
+    """Return a rig that sends the streams of a recording: JPEG images as a camera, and numbers as ``generic`` over TCP.
 
-    Raises `UsageError` if a column is not a number.
+    Streams of text, of other videos, of plans, of ground truth and of a single row are left out. The master is that of
+    the recording, or the first with tactile channels. Raises `UsageError` if none is left.
     """
-    fields = [field for field in recorded.schema if field.name not in (ARRIVAL, *STAMPS, DEVICE_COUNTER)]
-    texts = [field.name for field in fields if str(field.type) not in TYPES]
-    if texts:
-        raise UsageError(
-            f"{stream.name}: {stream.kind} cannot be emulated on {stream.address.scheme}, and its column {texts[0]} is "
-            "not a number that generic could send instead; remove the stream."
-        )
+    streams, tactile = {}, []
+    for name in recording.streams:
+        columns = recording.columns(name)
+        video_format = read_format(columns)
+        quantities = {(field.metadata or {}).get(b"quantity", b"").decode() for field in columns.schema}
+        is_signal = name != EVENTS and "plan" not in quantities and not any(map(is_truth, columns.schema))
+        if not is_signal or columns.num_rows < 2:
+            continue
+        tactile += [name] if "tactile" in quantities else []
+        if video_format is not None and video_format.codec == "mjpeg":
+            size = {"width_px": video_format.width_px, "height_px": video_format.height_px}
+            options = {**size, "rate_hz": round(1e9 / period_ns(columns), 3)}
+            camera = build_sensor("camera", options, f"stream {name}")
+            streams[name] = RigStream(name, "camera", camera, Address("v4l2", "/dev/video0"), options)
+        elif not _not_numbers(columns):
+            streams[name] = _as_generic(name, columns)
+    if not streams:
+        raise UsageError(f"Recording {recording.name} has no stream that can be replayed.")
+    master = str(recording.attributes.get("master", ""))
+    rig = Rig(streams, master if master in streams else [*tactile, *streams][0])
+    return replace(rig, text=to_toml(rig))
+
+
+def _not_numbers(recorded: Columns) -> list[str]:
+    return [field.name for field in _values(recorded) if str(field.type) not in TYPES]
+
+
+def _values(recorded: Columns) -> list[pa.Field]:
+    return [field for field in recorded.schema if field.name not in (ARRIVAL, *STAMPS, DEVICE_COUNTER)]
+
+
+def _numbers(fields: Sequence[pa.Field]) -> Iterator[dict[str, Any]]:
+    """Yield the numbers of ``generic`` for columns. Tactile columns of one array are one number, so their places stay."""
+    start = 0
+    while start < len(fields):
+        shared = _shared(fields[start])
+        alike = list(itertools.takewhile(lambda field: _shared(field) == shared, fields[start:]))  # noqa: B023
+        stem, _, axis = _ELEMENT.fullmatch(fields[start].name).groups()  # type: ignore[union-attr]  # it matches any name
+        axes = "".join(dict.fromkeys(_ELEMENT.fullmatch(field.name)[3] or "" for field in alike)) if axis else ""  # type: ignore[index]
+        names = [
+            f"{name}_{part}" if part else name
+            for name in numbered_names(stem, max(1, len(alike) // max(1, len(axes))))
+            for part in axes or [""]
+        ]
+        if shared["quantity"] == "tactile" and len(names) > 1 and names == [field.name for field in alike]:
+            yield {"name": stem, "count": len(names) // max(1, len(axes)), "axes": axes, **shared}
+            start += len(names)
+        else:
+            yield {"name": fields[start].name, **shared}
+            start += 1
+
+
+def _shared(field: pa.Field) -> dict[str, str]:
+    """Return what the columns of an array have in common."""
+    metadata = field.metadata or {}
+    about = {key: metadata.get(key.encode(), b"1").decode() for key in ("unit", "quantity")}
+    return {"type": TYPES[str(field.type)], **about}
+
+
+def _as_generic(name: str, recorded: Columns, rate_hz: float = 0.0, step: int = 1) -> RigStream:
+    """Return a stream that sends the recorded columns, all of them numbers, as frames of the sensor ``generic``.
+
+    ``rate_hz`` is the mean rate of the recording if it is 0, and ``step`` the increment of the counter per sample.
+    """
     stamps = [{"name": name, "type": kind} for name, kind in STAMPS.items() if name in recorded.column_names]
-    described = [
-        {"name": field.name, "type": TYPES[str(field.type)]}
-        | {key: (field.metadata or {}).get(key.encode(), b"1").decode() for key in ("unit", "quantity")}
-        for field in fields
-    ]
     options: dict[str, Any] = {
-        "rate_hz": stream.sensor.rate_hz or round(1e9 / period_ns(recorded), 3),
+        "rate_hz": rate_hz or round(1e9 / period_ns(recorded), 3),
         "marker": "A5 5A 96 69",
-        "numbers": [*stamps, *described, {"name": SUM, "type": "u32"}],
+        "numbers": [*stamps, *_numbers(_values(recorded)), {"name": SUM, "type": "u32"}],
         "sum": {"kind": "crc32", "number": SUM},
     }
-    roles = {"seq": {"sequence": {"number": "seq", "step": stream.sensor.step}}}
+    roles = {"seq": {"sequence": {"number": "seq", "step": step}}}
     roles["t_device_ns"] = {"clock": {"number": "t_device_ns", "unit": "ns"}}
     for number in stamps:
         options |= roles[number["name"]]
-    return RigStream(stream.name, "generic", build_sensor("generic", options, stream.name), Address("tcp", ""), options)
+    return RigStream(name, "generic", build_sensor("generic", options, name), Address("tcp", ""), options)
