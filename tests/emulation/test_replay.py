@@ -14,7 +14,7 @@ from tacpipe.errors import UsageError
 from tacpipe.recording import rig as rigs
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.emulation.emulator import ReplayEmulator
-from tacpipe.simulation.emulation.replay import PAUSE_NS, DueFrame, Replay, waits_for_requests
+from tacpipe.simulation.emulation.replay import PAUSE_NS, DueFrame, Replay, rig_of, waits_for_requests
 from tacpipe.testing.frames import decode_runs, feed_framer
 from tacpipe.video import files
 from tests.emulation.rigs import ALL_SENSORS, one_stream_rig
@@ -127,6 +127,37 @@ def test_a_device_that_cannot_be_emulated_is_replaced_by_frames_with_its_columns
     np.testing.assert_array_equal(columns_of(samples), recorded_columns(recorded, sensor=stream.sensor))
     assert samples.seq is not None and set(np.diff(samples.seq).tolist()) == {1}
     assert samples.t_device_ns is not None and set(np.diff(samples.t_device_ns).tolist()) == {1}
+
+
+def test_recordings_without_a_rig_are_sent_as_numbers_and_arrays_keep_the_places_of_their_taxels() -> None:
+    skin = [
+        pa.field(
+            f"taxel{n:02d}_{axis}",
+            pa.uint16(),
+            metadata={"unit": "count", "quantity": "tactile", "taxel": str(n), "axis": axis},
+        )
+        for n in (1, 2)
+        for axis in "xyz"
+    ]
+    arm = [pa.field("x_m", pa.float64(), metadata={"unit": "m", "quantity": "position", "component": "x"})]
+    text = [pa.field("word", pa.string(), metadata={"unit": "1", "quantity": "text"})]
+    truth = [pa.field("gt_x", pa.float64())]
+    t_ns = BEGIN_NS + STEP_NS * np.arange(5)
+    streams = {
+        name: schema.stream(t_ns, [pa.array(["a"] * 5) if fields is text else np.arange(5) for _ in fields], fields)
+        for name, fields in {"arm": arm, "skin": skin, "words": text, "truth": truth}.items()
+    }
+    recorded: Any = FakeRecording(streams, "trial")
+    rig = rig_of(recorded)
+    assert list(rig.streams) == ["arm", "skin"] and rig.master == "skin"
+    sent_fields = rig.streams["skin"].sensor.fields()
+    assert [(field.name, field.type, field.metadata) for field in sent_fields] == [
+        (field.name, field.type, field.metadata) for field in skin
+    ]
+    _, samples = sent(Replay(rig, [recorded]), 5, "skin")
+    assert columns_of(samples) == [[0, 1, 2, 3, 4]] * 6
+    with pytest.raises(UsageError, match="no stream that can be replayed"):
+        rig_of(FakeRecording({"words": streams["words"]}, "trial"))  # type: ignore[arg-type]
 
 
 def test_the_sensors_that_wait_for_requests_are_those_on_the_page() -> None:

@@ -52,3 +52,14 @@ def test_published_forces_are_recorded_and_are_those_that_predict_gives_for_the_
     expected = dict(zip(table["t_ns"].to_pylist(), table["gt_finger1_normal_n"].to_pylist(), strict=True))
     values = np.array([message["values"]["gt_finger1_normal_n"] for message in answered])
     assert values.tolist() == [expected[message["t_ns"]] for message in answered]
+
+    with subscriber() as (port, messages):  # the recordings themselves are a rig
+        options = f"--model models/force --json --publish udp:127.0.0.1:{port}"
+        process = commanded(lab, f"live --replay data/r {options}")
+        live.awaited(
+            lambda: sum(bool(message.get("values")) for message in messages) > 20 or process.poll() is not None
+        )
+        ended(process, interrupt=True)
+    assert sum(bool(message.get("values")) for message in messages) > 20
+    refused = lab.call("live --model models/force")
+    assert refused.code == 2 and "--replay" in refused.err

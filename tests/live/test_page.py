@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tacpipe.live.messages import Message
+from tacpipe.live.messages import Description, Message
 from tacpipe.live.websocket import TOKEN, WebsocketPublisher
 from tacpipe.sensors.live import OFF, ON
 from tacpipe.tasks.forward.live.messages import ForecastDescription, ForecastMessage
+from tacpipe.tasks.learning.live.messages import EstimateDescription, EstimateMessage
 from tacpipe.tasks.slip.live.messages import SlipDescription, SlipMessage
 from tests.live.test_publishers import free_port
 from tests.recording.live import awaited
@@ -33,7 +34,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
-def visit(chromium: Browser, about: SlipDescription | ForecastDescription, max_age_ms: int) -> WebsocketPublisher:
+def visit(chromium: Browser, about: Description, max_age_ms: int) -> WebsocketPublisher:
     """Return a publisher whose page a browser shows, with the maximum age of its messages."""
     port = free_port()
     publisher = WebsocketPublisher(f"127.0.0.1:{port}", about)
@@ -42,9 +43,7 @@ def visit(chromium: Browser, about: SlipDescription | ForecastDescription, max_a
     return publisher
 
 
-def show(
-    chromium: Browser, about: SlipDescription | ForecastDescription, messages: list[Message]
-) -> WebsocketPublisher:
+def show(chromium: Browser, about: Description, messages: list[Message]) -> WebsocketPublisher:
     """Return a publisher whose page a browser shows, once it has drawn the messages, which it keeps for minutes."""
     publisher = visit(chromium, about, 600_000)
     for number, message in enumerate(messages, start=1):
@@ -68,7 +67,7 @@ def test_the_page_draws_the_skins_the_probability_and_the_alarm(chromium: Browse
         for number in range(1, 10)
     ]
     publisher = show(chromium, SLIPS, messages)
-    assert chromium.run("document.getElementById('title').textContent") == "tacpipe live: models/slip"
+    assert chromium.run("document.getElementById('title').textContent") == "slip · tacpipe live"
     assert chromium.run("document.getElementById('answer').textContent") == "0.90"
     assert chromium.run("document.getElementById('state').textContent") == "alarm on"
     assert chromium.run("document.body.classList.contains('alarm')") is True
@@ -86,6 +85,23 @@ def test_the_page_draws_the_skins_and_the_forecast_of_a_session_of_forecasts(chr
     assert chromium.run("ahead.map((row) => row[1])") == [2.5, 5.0]
     assert chromium.run("about.touch") == {"left": [5.0, 0.0]}
     assert chromium.run(PAINTED.format("history", 900, 220)) > 1000
+    assert chromium.run("document.getElementById('answer').textContent") == "5"
+    assert "count, size of the touch in 0.10 s" in chromium.run("document.getElementById('what').textContent")
+    publisher.publish(ForecastMessage(2, 40_000_000, None, cause="no sample comes from left"))
+    awaited(lambda: chromium.run("messages") == 2)
+    assert chromium.run("document.getElementById('answer').textContent") == "–"
+    events = chromium.run("[...document.getElementById('events').children].map((item) => item.textContent.slice(-25))")
+    assert events[0] == "no sample comes from left"
+    left(chromium, publisher)
+
+
+def test_the_page_shows_each_target_of_a_session_of_estimates_with_its_unit(chromium: Browser) -> None:
+    about = EstimateDescription("models/force", ("fz", "fx"), ("N", "N"), 50.0)
+    publisher = show(
+        chromium, about, [EstimateMessage(1, 20_000_000, ("fz", "fx"), np.array([1.25, -0.5]), band=np.zeros((2, 2)))]
+    )
+    assert chromium.run("document.getElementById('answer').textContent") == "1.25 N · -0.5 N"
+    assert chromium.run("rows.map((row) => row[1])") == [1.25]
     left(chromium, publisher)
 
 

@@ -279,19 +279,23 @@ def _values(recorded: Columns) -> list[pa.Field]:
 
 def _numbers(fields: Sequence[pa.Field]) -> Iterator[dict[str, Any]]:
     """Yield the numbers of ``generic`` for columns. Tactile columns of one array are one number, so their places stay."""
-    start = 0
+    start, stems = 0, set[str]()
     while start < len(fields):
         shared = _shared(fields[start])
-        alike = list(itertools.takewhile(lambda field: _shared(field) == shared, fields[start:]))  # noqa: B023
-        stem, _, axis = _ELEMENT.fullmatch(fields[start].name).groups()  # type: ignore[union-attr]  # it matches any name
-        axes = "".join(dict.fromkeys(_ELEMENT.fullmatch(field.name)[3] or "" for field in alike)) if axis else ""  # type: ignore[index]
-        names = [
-            f"{name}_{part}" if part else name
-            for name in numbered_names(stem, max(1, len(alike) // max(1, len(axes))))
-            for part in axes or [""]
+        alike = [
+            field.name
+            for field in itertools.takewhile(lambda field: _shared(field) == shared, fields[start:])  # noqa: B023
         ]
-        if shared["quantity"] == "tactile" and len(names) > 1 and names == [field.name for field in alike]:
-            yield {"name": stem, "count": len(names) // max(1, len(axes)), "axes": axes, **shared}
+        parts = [_ELEMENT.fullmatch(name) for name in alike]
+        stem = parts[0][1] if parts[0] else ""
+        axes = list(dict.fromkeys(part[3] for part in parts if part and part[3]))
+        count = len(alike) // max(1, len(axes))
+        names = [
+            f"{name}_{axis}" if axis else name for name in numbered_names(stem, max(1, count)) for axis in axes or [""]
+        ]
+        if shared["quantity"] == "tactile" and count > 1 and names == alike and stem not in stems:
+            yield {"name": stem, "count": count, "axes": "".join(axes), **shared}
+            stems.add(stem)
             start += len(names)
         else:
             yield {"name": fields[start].name, **shared}
