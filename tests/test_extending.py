@@ -88,6 +88,7 @@ class Project:
 
 
 @pytest.mark.long
+@pytest.mark.minutes
 @pytest.mark.timeout(3600)
 def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_path: Path) -> None:
     """One project serves all pages: what one computed is reused on the next."""
