@@ -46,7 +46,7 @@ def common_unit(configs: Iterable[ForwardConfig]) -> str:
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # displayed steps, if the model predicts them
-Errors = tuple[AnyFloats, AnyFloats]  # sums of a recording's squared and absolute errors, each (step,)
+Errors = AnyFloats | tuple[AnyFloats, AnyFloats]  # sums of a recording's squared and absolute errors, each (step,)
 GEOMETRIC = "mae_counts_geometric"  # skill in ``metrics.json`` that is not pooled over recordings
 RECORDINGS, OBJECTS = "recordings", "objects"  # resampling units of the confidence interval
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
