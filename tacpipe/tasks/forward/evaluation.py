@@ -28,7 +28,6 @@ from tacpipe.tasks.forward.headline import (
     MODEL,
     PARTS,
     TASK,
-    QuantileMeasures,
     headline_steps,
     look_ahead_notes,
     unit_of_model,
@@ -92,7 +91,7 @@ class QuantileSums:
         unseen = self._measures(fresh, uncertainty.percents) if fresh else {}
         return {**self.forecaster.config["quantiles"], **unseen, **measures}
 
-    def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
+    def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, dict[str, dict[str, float]]]:
         """Return the measures of each predictor by step, with intervals over recordings, or unseen objects."""
         # sums by predictor, by unit of the interval (recording, or unseen object)
         sums_by_unit: dict[str, dict[str, Sums]] = {}
@@ -229,9 +228,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             del track
             advance(note=name)
     rows_of_errors = metrics.error_rows(trials, Groups.from_model(forecaster))
-    scores, parts = metrics.summary(trials, rows_of_errors, forecaster.horizon)
     further = {"situations": by_situation.summary(), "quantiles": bands.summary(trials), "rest_shift": shifts}
-    measured = {**scores.to_json(), **{name: part.to_json() for name, part in parts.items()}}
+    measured = metrics.summary(trials, rows_of_errors, forecaster.horizon)
     measured |= {name: values for name, values in further.items() if values}
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     errors = ErrorSums.from_rows(rows_of_errors[~rows_of_errors["seen"].astype(bool)])
@@ -240,7 +238,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     files = {
         headline.FILE: headline.write(table.headlines(TASK, method, tables)),
         "metrics.json": model_files.to_json(measured),
-        "horizons.csv": metrics.horizons_csv(scores.predictors, forecaster.config["rate_hz"]),
+        "horizons.csv": metrics.horizons_csv(errors, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials, len(forecaster.channel_scale)),
         ERRORS_FILE: metrics.errors_parquet(rows_of_errors),
         **bands.files(trials),

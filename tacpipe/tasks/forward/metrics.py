@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,20 +11,14 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
+from tacpipe.datasets.model_files import to_csv
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.scores import intervals, regression
 from tacpipe.scores.intervals import Interval
 from tacpipe.scores.table import ScoreTable
 from tacpipe.tasks.forward import headline as headlines
-from tacpipe.tasks.forward.headline import (
-    BASELINE,
-    MODEL,
-    ForwardScores,
-    IntervalsByStep,
-    PredictorScores,
-    WindowCounts,
-)
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
 
 if TYPE_CHECKING:  # the first imports torch
     import pandas as pd
@@ -261,32 +253,26 @@ def divide(trials: Sequence[Trial]) -> tuple[list[Trial], dict[str, list[Trial]]
     return fresh, {**(by_object if all(by_object.values()) else {}), "seen": [trial for trial in trials if trial.seen]}
 
 
-def summary(
-    trials: Sequence[Trial], rows: pd.DataFrame, horizon: int
-) -> tuple[ForwardScores, dict[str, ForwardScores]]:
-    """Return the scores of all predictors on recordings that the model has not seen, and those of the parts of `divide`.
+def summary(trials: Sequence[Trial], rows: pd.DataFrame, horizon: int) -> dict[str, Any]:
+    """Return ``metrics.json``: scores on recordings that the model has not seen, and those of the parts of `divide`.
 
     ``rows`` are those of `error_rows`. Parts without recordings are left out.
     """
     fresh, parts = divide(trials)
-    return _scores(fresh, rows, horizon), {name: _scores(part, rows, horizon) for name, part in parts.items() if part}
+    by_part = {name: _scores(part, rows, horizon) for name, part in parts.items() if part}
+    return {**_scores(fresh, rows, horizon), **by_part}
 
 
-def horizons_csv(scores_by_predictor: Mapping[str, PredictorScores], rate_hz: float) -> bytes:
+def horizons_csv(errors: ErrorSums, rate_hz: float) -> bytes:
     """Return a CSV file of errors by predictor and step."""
     rows = [
-        (
-            name,
-            step,
-            round(1000 * step / rate_hz, 3) if rate_hz else "",
-            scores["mse_counts"]["both"][f"t{step}"],
-            scores["mae_counts"]["both"][f"t{step}"],
-            scores["mse_standard"][f"t{step}"],
+        (name, step, round(1000 * step / rate_hz, 3) if rate_hz else "", *map(_round, means))
+        for name in errors.predictors
+        for step, *means in zip(
+            errors.steps, *errors.means(name, ALL_CHANNELS), errors.means(name, STANDARD)[0], strict=True
         )
-        for name, scores in scores_by_predictor.items()
-        for step in range(1, len(scores["mse_standard"]))
     ]
-    return _csv(("predictor", "step", "horizon_ms", "mse_counts", "mae_counts", "mse_standard"), rows)
+    return to_csv(("predictor", "step", "horizon_ms", "mse_counts", "mae_counts", "mse_standard"), rows)
 
 
 def errors_parquet(rows: pd.DataFrame) -> bytes:
@@ -317,25 +303,25 @@ def trials_csv(trials: Sequence[Trial], width: int) -> bytes:
                 *errors,
             )
         )
-    return _csv(
+    return to_csv(
         ("recording", "object", "known", "seen", "windows", "mae_counts_model", "mae_counts_persistence", "skill"), rows
     )
 
 
-def _scores(trials: Sequence[Trial], rows: pd.DataFrame, horizon: int) -> ForwardScores:
+def _scores(trials: Sequence[Trial], rows: pd.DataFrame, horizon: int) -> dict[str, Any]:
     """Return the errors of each predictor, the model's skill, and counts, over the recordings that contain windows."""
     evaluated = {item.name: item for item in trials if item.windows}
     windows = sum(item.windows for item in evaluated.values())
-    counts: WindowCounts = {
+    counts = {
         "windows": windows,
         "recordings": len(evaluated),
         "recordings_without_window": len(trials) - len(evaluated),
-        "effective_windows": windows // horizon,
+        "effective_windows": windows // horizon,  # number of windows with non-overlapping horizons
     }
     if not evaluated:
-        return ForwardScores(counts, {}, {})
+        return {"counts": counts}
     errors = ErrorSums.from_rows(rows[rows["recording"].isin(evaluated)])
-    predictors: dict[str, PredictorScores] = {}
+    predictors: dict[str, Any] = {}
     for name in errors.predictors:
         means = {group: errors.means(name, group) for group in errors.channels if (name, group) in errors.sums}
         of_channels = {group: both for group, both in means.items() if group not in SCALED}
@@ -356,7 +342,7 @@ def _scores(trials: Sequence[Trial], rows: pd.DataFrame, horizon: int) -> Forwar
     ):
         model, baseline = (errors.sums[name, group][part] for name in (MODEL, BASELINE))
         skill[measure] = skill_by_step(interval, model, baseline, units)
-    return ForwardScores(counts, predictors, skill)
+    return {"counts": counts, **predictors, "skill": skill}
 
 
 def by_step(errors: AnyFloats) -> dict[str, float]:
@@ -366,7 +352,7 @@ def by_step(errors: AnyFloats) -> dict[str, float]:
 
 def skill_by_step(
     interval: Callable[..., Interval], model: AnyFloats, baseline: AnyFloats, clusters: AnyArray | None = None
-) -> IntervalsByStep:
+) -> dict[str, dict[str, float]]:
     """Return skill with intervals over clusters by step and over all steps, from sums (recording, step).
 
     ``interval`` is a function of `tacpipe.scores.intervals`, and ``clusters`` (recording,) are the units that are
@@ -375,7 +361,7 @@ def skill_by_step(
     with_total = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
     skill = interval(*with_total, clusters)
     names = [f"t{step}" for step in range(1, len(skill.mean))] + ["mean"]
-    tree: IntervalsByStep = {}
+    tree = {}
     for index, name in enumerate(names):
         ends = {part: float(getattr(skill, part)[index]) for part in ("mean", "low", "high")}
         tree[name] = {part: _round(value) for part, value in ends.items() if math.isfinite(value)}
@@ -385,12 +371,3 @@ def skill_by_step(
 def _round(value: float) -> float:
     """Round ``value`` to 9 digits, because further digits differ between machines."""
     return float(f"{value:.9g}")
-
-
-def _csv(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> bytes:
-    """Return the content of a CSV file with ``header``."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue().encode()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +11,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
-from tacpipe.datasets import selection
+from tacpipe.datasets import model_files, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
@@ -200,20 +198,19 @@ def _scores(grasps: GraspPredictions) -> dict[str, Any]:
     return {"counts": {"grasps": len(grasps), "objects": len(by_object)}, **predictors}
 
 
+OBJECT_MEASURES = ("rmse", "rmse_counts", "r2", "skill")
+
+
 def _object_csv(scores: Json) -> bytes:
     """Return CSV with one row per object, predictor and target: grasps, relative RMSE, RMSE in counts, R2 and skill."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
+    rows = []
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
-        by_object = scores[predictor]["by_object"] if predictor in scores else {}
-        for name, measures in by_object.items():
+        for name, measures in scores.get(predictor, {"by_object": {}})["by_object"].items():
             for target in measures["rmse"]:
-                scored = (measures["rmse"], measures["rmse_counts"], measures["r2"], measures["skill"])
-                values = [by_target[target] for by_target in scored]
+                values = [measures[measure][target] for measure in OBJECT_MEASURES]
                 rounded = ["" if value is None else f"{value:.6g}" for value in values]
-                writer.writerow([name, predictor, target, measures["n"], *rounded])
-    return text.getvalue().encode()
+                rows.append([name, predictor, target, measures["n"], *rounded])
+    return model_files.to_csv(("object", "predictor", "target", "n", *OBJECT_MEASURES), rows)
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
