@@ -112,11 +112,10 @@ def _run(run: ForwardResult, steps: Sequence[int], usual: str) -> ComparedRun:
     timeline = f"{run.timeline} timeline" if elsewhere else ""
     questions = {}
     for known_objects, scored in run.errors.tables(steps, headline.unit_of_model(config)).items():
-        names = {name: name_with_codec(name, str(config["codec"]["name"])) for name in scored.sums}
         part = ", ".join(filter(None, (headline.PARTS[known_objects], timeline)))
-        questions[Question(part, place=2 * elsewhere + (known_objects is False))] = replace(
-            scored, sums={names[name]: sums for name, sums in scored.sums.items()}
-        )
+        question = Question(part, place=2 * elsewhere + (known_objects is False))
+        sums = {name_with_codec(name, str(config["codec"]["name"])): own for name, own in scored.sums.items()}
+        questions[question] = replace(scored, sums=sums)
     return ComparedRun(
         run.dataset,
         headline.TASK,

@@ -36,6 +36,12 @@ def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
     assert sums[1].tolist() == (2 * sums[0]).tolist()
 
 
+def test_the_mean_error_weighs_windows_and_not_recordings() -> None:
+    squared, absolute = ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS)).means("model", "x")
+    assert squared == pytest.approx([(0.5 * 10 + 0.25 * 30) / 40 * step for step in (1, 2, 3)])
+    assert absolute == pytest.approx(2 * squared)
+
+
 def test_recordings_that_were_trained_on_are_left_out() -> None:
     assert ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1"])).recordings == ("r2",)
     empty = ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1", "r2"]))
