@@ -175,11 +175,3 @@ def test_sums_are_those_of_plain_loops() -> None:
             assert regression.absolute_error_sums(predicted, truth)[step, channel] == pytest.approx(
                 sum(map(abs, errors))
             )
-
-
-def test_the_mean_error_weighs_windows_and_not_recordings() -> None:
-    errors = [RNG.normal(size=(count, 3, 2)) ** 2 for count in (1, 7)]
-    sums = np.stack([squared.sum(axis=0) for squared in errors])
-    expected = np.concatenate(errors).mean(axis=(0, 2))
-    assert np.allclose(regression.mean_error(sums, np.array([1, 7])), expected)
-    assert np.isnan(regression.mean_error(np.zeros((0, 3, 2)), np.zeros(0, dtype=np.int64))).all()

@@ -7,9 +7,11 @@ memory, which is allocated only if all of its tensors are in the file with the s
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +95,17 @@ def to_json(tree: Mapping[str, object]) -> bytes:
     b'{\n "a": null,\n "b": [\n  1\n ]\n}\n'
     """
     return (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode()
+
+
+def to_csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
+    r"""Return the text of a CSV file of a result.
+
+    >>> to_csv(("name", "n"), [("a", 1)])
+    b'name,n\na,1\n'
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue().encode()
 
 
 def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, AnyFloats, Ints
+from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.scores import intervals
 from tacpipe.scores.intervals import Estimate
@@ -125,13 +125,3 @@ def absolute_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
     """Return the absolute error summed over windows: (window, step, channel) to (step, channel), as float64."""
     total: AnyFloats = np.abs(predicted.astype(np.float64) - truth).sum(axis=0)
     return total
-
-
-def mean_error(sums: AnyFloats, windows: Ints) -> AnyFloats:
-    """Return the error of each step, averaged over all windows and channels, shape (step,).
-
-    ``sums`` is (recording, step, channel) as summed above, ``windows`` is (recording,). NaN if there are no windows.
-    """
-    count = windows.sum() * sums.shape[2]
-    total: AnyFloats = sums.sum(axis=(0, 2))
-    return total / count if count else np.full(sums.shape[1], np.nan)

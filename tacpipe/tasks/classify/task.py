@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.requirements import Label, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
 from tacpipe.tasks.classify.params import Params
-from tacpipe.tasks.learning.task import LearnedTask
+from tacpipe.tasks.learning.task import SESSION, TOUCH, LearnedTask
 from tacpipe.tasks.task import Demo
 
 if TYPE_CHECKING:
@@ -20,20 +20,10 @@ REQUIREMENTS = Requirements(
     stages=(),
     optional_stages=("synchronize, or segment, or none",),
     roles="recordings of each class with the role train",
-    channels=(
-        Channels(
-            "tactile",
-            (),
-            "any number of columns, in rows at a nearly constant rate; others with --inputs",
-        ),
-    ),
+    channels=(TOUCH,),
     labels=(
         Label("object", "any label, column or kind of labelled intervals", "Without it, --label names another one."),
-        Label(
-            "session",
-            "any label, by --group and --recentre",
-            "Without --group, each recording is left out by itself in cross-validation.",
-        ),
+        SESSION,
     ),
 )
 

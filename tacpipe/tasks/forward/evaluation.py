@@ -20,17 +20,19 @@ from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.scores import calibration, headline, table
 from tacpipe.scores.calibration import COVERAGE_FILE, Sums
+from tacpipe.scores.table import Question
 from tacpipe.tasks.forward import metrics, rest_shift, situations, tracks
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.headline import (
     BASELINE,
     MODEL,
+    PARTS,
     TASK,
-    QuantileMeasures,
+    headline_steps,
     look_ahead_notes,
     unit_of_model,
 )
-from tacpipe.tasks.forward.metrics import Trial
+from tacpipe.tasks.forward.metrics import ERRORS_FILE, ErrorSums, Groups, Trial
 from tacpipe.tasks.forward.predictors import WindowForecast, iterate_predictions
 from tacpipe.tasks.forward.quantiles import CHUNK, ForecastQuantiles
 from tacpipe.tasks.forward.situations import BySituation
@@ -89,7 +91,7 @@ class QuantileSums:
         unseen = self._measures(fresh, uncertainty.percents) if fresh else {}
         return {**self.forecaster.config["quantiles"], **unseen, **measures}
 
-    def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, QuantileMeasures]:
+    def _measures(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, dict[str, dict[str, float]]]:
         """Return the measures of each predictor by step, with intervals over recordings, or unseen objects."""
         # sums by predictor, by unit of the interval (recording, or unseen object)
         sums_by_unit: dict[str, dict[str, Sums]] = {}
@@ -225,19 +227,20 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
                 shifts[name] = shift
             del track
             advance(note=name)
-    groups = metrics.channel_groups(forecaster.codec.layout)
-    scores, parts = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
+    rows_of_errors = metrics.error_rows(trials, Groups.from_model(forecaster))
     further = {"situations": by_situation.summary(), "quantiles": bands.summary(trials), "rest_shift": shifts}
-    measured = {**scores.to_json(), **{name: part.to_json() for name, part in parts.items()}}
+    measured = metrics.summary(trials, rows_of_errors, forecaster.horizon)
     measured |= {name: values for name, values in further.items() if values}
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
-    tables = metrics.score_tables(trials, forecaster.horizon, unit_of_model(forecaster.config))
+    errors = ErrorSums.from_rows(rows_of_errors[~rows_of_errors["seen"].astype(bool)])
+    steps, unit = headline_steps(range(1, forecaster.horizon + 1)), unit_of_model(forecaster.config)
+    tables = {Question(PARTS[known_objects]): own for known_objects, own in errors.tables(steps, unit).items()}
     files = {
         headline.FILE: headline.write(table.headlines(TASK, method, tables)),
         "metrics.json": model_files.to_json(measured),
-        "horizons.csv": metrics.horizons_csv(scores.predictors, forecaster.config["rate_hz"]),
-        "trials.csv": metrics.trials_csv(trials),
-        "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
+        "horizons.csv": metrics.horizons_csv(errors, forecaster.config["rate_hz"]),
+        "trials.csv": metrics.trials_csv(trials, len(forecaster.channel_scale)),
+        ERRORS_FILE: metrics.errors_parquet(rows_of_errors),
         **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
@@ -263,7 +266,7 @@ def _predictions(
     """
     starts = track.starts(forecaster.context, forecaster.horizon)
     track.count_rows(starts, forecaster.context + forecaster.horizon)
-    steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
+    groups, steps = Groups.from_model(forecaster), [step for step in STORED_STEPS if step <= forecaster.horizon]
     no_windows = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, no_windows))
     for windows in iterate_predictions(forecaster, track, starts):
@@ -274,7 +277,7 @@ def _predictions(
             by_situation.count(trial.name, doing)
         truth = windows.truth
         for name, prediction in windows.each_prediction():
-            trial.add_errors(name, prediction, truth, forecaster.feature_half)
+            trial.add_errors(name, prediction, truth, groups)
             if not trial.seen:
                 by_situation.add(trial.name, doing, name, prediction, truth)
         bands.add(track, trial, windows.forecast)

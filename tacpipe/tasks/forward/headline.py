@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.io import Json
 from tacpipe.scores import intervals
 from tacpipe.scores.pairing import Measure
 from tacpipe.scores.table import ScoreTable
@@ -46,7 +45,7 @@ def common_unit(configs: Iterable[ForwardConfig]) -> str:
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # displayed steps, if the model predicts them
-Errors = tuple[AnyFloats, AnyFloats]  # sums of a recording's squared and absolute errors, each (step,)
+Errors = AnyFloats | tuple[AnyFloats, AnyFloats]  # sums of a recording's squared and absolute errors, each (step,)
 GEOMETRIC = "mae_counts_geometric"  # skill in ``metrics.json`` that is not pooled over recordings
 RECORDINGS, OBJECTS = "recordings", "objects"  # resampling units of the confidence interval
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
@@ -80,51 +79,6 @@ def look_ahead_notes(config: ForwardConfig) -> list[str]:
         f"{ahead['max_ms']:g} ms, so errors are smaller than a live session's. Synchronize without --values interpolate for "
         f"models to act on."
     ]
-
-
-IntervalsByStep = dict[str, dict[str, float]]  # mean, lower and upper bound of a value by step
-QuantileMeasures = dict[str, dict[str, float]]  # by measure and step
-
-
-class WindowCounts(TypedDict):
-    """Numbers of evaluated windows and recordings."""
-
-    windows: int
-    recordings: int
-    recordings_without_window: int
-    effective_windows: int  # number of windows with non-overlapping horizons
-
-
-class PredictorScores(TypedDict):
-    """Mean errors of a predictor by step (``t1``, ``t2``, …) and over all steps (``mean``)."""
-
-    mse_counts: dict[str, dict[str, float]]  # by channel group
-    mae_counts: dict[str, dict[str, float]]
-    mse_standard: dict[str, float]  # in units of each channel's standard deviation in training
-    mse_latent: NotRequired[dict[str, float]]
-    mse_feature: NotRequired[dict[str, float]]  # of latents scaled to ±1
-
-
-@dataclass(frozen=True)
-class ForwardScores:
-    """Errors and skill on a set of recordings."""
-
-    counts: WindowCounts
-    predictors: dict[str, PredictorScores]  # empty if no recording has a window
-    skill: dict[str, IntervalsByStep]  # of the model relative to persistence, by measure
-
-    def to_json(self) -> Json:
-        """Return ``metrics.json`` or one of its parts."""
-        return {"counts": self.counts, **self.predictors, **({"skill": self.skill} if self.skill else {})}
-
-
-class SituationMeasures(TypedDict):
-    """Errors and skill of forecasts in one situation."""
-
-    windows: int
-    recordings: int
-    mae_counts: dict[str, dict[str, float]]  # by predictor and step
-    skill: dict[str, dict[str, float]]  # mean, lower and upper bound by step
 
 
 @dataclass(frozen=True)

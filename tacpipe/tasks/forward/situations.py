@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.scores import intervals, regression
-from tacpipe.tasks.forward.headline import BASELINE, MODEL, SituationMeasures
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.metrics import by_step, skill_by_step
 
 if TYPE_CHECKING:  # these modules import torch, which a report does not need
@@ -105,7 +105,7 @@ class BySituation:
             chosen = situations == situation
             sums[situation] += regression.absolute_error_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
 
-    def summary(self) -> dict[str, SituationMeasures]:
+    def summary(self) -> dict[str, dict[str, Any]]:
         """Return windows, recordings, mean absolute errors by predictor and step, and the model's skill, by situation.
 
         Skill is 1 minus the geometric mean over recordings of the mean absolute error relative to persistence's, by
@@ -116,7 +116,7 @@ class BySituation:
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
-    def _measures(self, index: int) -> SituationMeasures:
+    def _measures(self, index: int) -> dict[str, Any]:
         """Return the measures of the situation with the index ``index``."""
         recordings = self._recordings(index)
         count = sum(int(self.windows[name][index]) for name in recordings)

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.scores import calibration
+from tacpipe.scores import calibration, intervals
 from tacpipe.scores.pairing import Measure
 from tacpipe.scores.table import MODEL, Question, ScoreTable, rounded
 from tacpipe.tasks.learning.answers import Classes, Quantities, Target
@@ -191,7 +191,7 @@ def quantity_measure(target: Target, cluster: str) -> Measure:
         "skill",
         cluster,
         mean,
-        lambda error, baseline: np.where(baseline > 0, 1 - error / np.where(baseline > 0, baseline, 1), np.nan),
+        intervals.skill,
         values,
         scored=f"mean absolute error{unit}",
         weight=lambda sums: sums[:, 1],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from tacpipe.plugins.requirements import Channels, Label
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.task import Calibration, Files, PredictionRequest, Task
 
@@ -13,6 +14,14 @@ if TYPE_CHECKING:
     from tacpipe.report.context import TaskReport
     from tacpipe.tasks.learning.model import LearnedModel
     from tacpipe.tasks.recordings import OpenedChain
+
+
+TOUCH = Channels("tactile", (), "any number of columns, in rows at a nearly constant rate; others with --inputs")
+SESSION = Label(
+    "session",
+    "any label, by --group and --recentre",
+    "Without --group, each recording is left out by itself in cross-validation.",
+)
 
 
 class LearnedTask(Task):

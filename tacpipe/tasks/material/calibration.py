@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -187,11 +185,8 @@ class Answers:
         """
         if not self.classifier.calibrations:
             return {}
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(("recording", "sensor", "known", "seen", "named", "probability", "score", "answer", "label"))
-        writer.writerows(self.rows)
-        return {ANSWERS: text.getvalue().encode()}
+        heads = ("recording", "sensor", "known", "seen", "named", "probability", "score", "answer", "label")
+        return {ANSWERS: model_files.to_csv(heads, self.rows)}
 
 
 def _probability_fit(scores: Float32s, labels: AnyArray, right: Bools, divisor: float) -> StatedProbabilities:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Int64s
@@ -24,12 +23,19 @@ from tacpipe.scores.table import Question, ScoreTable
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, Classifier, ReaderOutput
-from tacpipe.tasks.material.headline import ChanceAccuracy, MaterialScores, SensorAccuracy, ZeroShotAccuracy
+from tacpipe.tasks.material.headline import SensorAccuracy, ZeroShotAccuracy
 from tacpipe.tasks.material.network_training import HISTORY
-from tacpipe.tasks.material.params import MEAN_LEVEL
+from tacpipe.tasks.material.predictions import (
+    LAST,
+    LEVEL,
+    MODEL,
+    PREDICTIONS,
+    PREDICTORS,
+    SWAPPED,
+    read_slides,
+    score_tables,
+)
 from tacpipe.tasks.material.slides import Slides
-
-MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
 
 
 def accuracy(correct: Mapping[str, Bools]) -> SensorAccuracy:
@@ -54,44 +60,40 @@ def accuracy(correct: Mapping[str, Bools]) -> SensorAccuracy:
     }
 
 
-def chance(counts: Mapping[str, int], classes: int) -> ChanceAccuracy:
-    """Return the accuracy of guessing one of ``classes`` by sensor."""
-    shares = {sensor: 1 / classes for sensor, count in counts.items() if count}
-    return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
+def summary(tables: Mapping[str, ScoreTable], predictors: Sequence[str], classes: int) -> dict[str, Any]:
+    """Return the metrics of tables of scores by sensor: accuracies, and the comparison with the mean level, if there is one.
 
-
-def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> MaterialScores:
-    """Return the scores of predictors; ``right`` contains masks of correct slides (slide,) by predictor and sensor.
-
-    Without the mean level there are no comparisons with it.
+    ``skill`` is the fraction of the mean level's errors that the model corrects, and ``mcnemar`` the exact p of McNemar's
+    test. Guessing is among ``classes``.
     """
-    counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
-    skill = disagreements = None
-    if MEAN_LEVEL in right:
-        pairs = {sensor: (model, right[MEAN_LEVEL][sensor]) for sensor, model in right[MODEL].items() if len(model)}
-        skill = {
+    right = {
+        name: {
+            sensor: np.array([correct == 1 for correct, _ in scored.sums[name].values()], bool)
+            for sensor, scored in tables.items()
+            if name in scored.sums
+        }
+        for name in predictors
+    }
+    n = {sensor: len(scored.sums.get(MODEL, {})) for sensor, scored in tables.items()}
+    guessed = {sensor: count for sensor, count in n.items() if count}
+    metrics: dict[str, Any] = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+    metrics["chance"] = {"accuracy": dict.fromkeys(guessed, 1 / classes), "n": guessed}
+    metrics["counts"] = {"slides": n}
+    if LEVEL in right:
+        pairs = {sensor: (right[MODEL][sensor], level) for sensor, level in right[LEVEL].items()}
+        metrics["skill"] = {
             sensor: float(1 - (~model).mean() / (~level).mean())
             for sensor, (model, level) in pairs.items()
             if not level.all()
         }
-        disagreements = {sensor: mcnemar(*pair) for sensor, pair in pairs.items()}
-    predictors = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
-    return MaterialScores(predictors, chance(counts, classes), counts, skill, disagreements)
+        metrics["mcnemar"] = {"model_vs_mean_level": {sensor: mcnemar(*pair) for sensor, pair in pairs.items()}}
+    return metrics
 
 
-def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:
-    """Return the confusion counts of each sensor's slides as CSV."""
-    counts: dict[tuple[str, Any, Any], int] = {}
-    for key in zip(sensors, materials, predicted, strict=True):
-        counts[key] = counts.get(key, 0) + 1
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["sensor", "material", "predicted", "count"])
-    writer.writerows([*key, count] for key, count in sorted(counts.items()))
-    return text.getvalue().encode()
-
-
-PREDICTIONS = "predictions"
+def confusion_csv(slides: pd.DataFrame) -> bytes:
+    """Return the confusion counts of each sensor's slides, rows of `read_slides`, as CSV."""
+    counts = slides.groupby(["sensor", "material", MODEL]).size().rename("count").reset_index()
+    return counts.rename(columns={MODEL: "predicted"}).to_csv(index=False, lineterminator="\n").encode()
 
 
 @dataclass
@@ -104,12 +106,6 @@ class Evaluated:
     predicted: dict[str, Int64s]  # predictor -> predicted material (slide,)
     held_out: Bools  # (slide,), whether this sensor did not learn its material's label
     zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's predictions: among all, held-out
-    counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,), whether it is evaluated
-
-    def is_right(self, predictor: str, mask: Bools) -> Bools:
-        """Return whether a predictor classified each slide in ``mask`` correctly (chosen slide,)."""
-        is_right: Bools = (self.predicted[predictor] == self.slides.materials)[mask]
-        return is_right
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -141,31 +137,23 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     metrics = answers.metrics()
     if zero_shot := _zero_shot(evaluated, classifier):
         metrics["zero_shot"] = zero_shot
-    seen = _summary(evaluated, classifier, seen=True)
-    tree = {
-        **_summary(evaluated, classifier, seen=False).to_json(),
-        **metrics,
-        **({"seen": seen.to_json()} if any(seen.slides.values()) else {}),
-    }
-    rows: list[tuple[str, Evaluated, int]] = []
-    for sensor, result in evaluated.items():
-        rows += [(sensor, result, int(index)) for index in np.flatnonzero(result.counted & ~result.in_training)]
+    sessions = {name: labels.get("session") for name, labels in attributes.items()}
+    predicted, classes = predictions_table(evaluated, classifier, sessions), len(classifier.classes)
+    rows = read_slides(predicted, classifier.config)
+    predictors = [name for name in PREDICTORS if name in rows]
+    learned, unseen = rows[~rows["held_out"]], rows[~rows["seen"]]
+    tables, seen = (score_tables(learned[learned["seen"] == is_seen], evaluated, classes) for is_seen in (False, True))
+    tree = {**summary(tables, predictors, classes), **metrics}
+    if learned["seen"].any():
+        tree["seen"] = summary(seen, predictors, classes)
+    questions = {Question(headlines.sensor_title(sensor)): scored for sensor, scored in tables.items()}
     files = {
-        headline.FILE: headline.write(
-            table.headlines(headlines.TASK, classifier.config["architecture"], _tables(evaluated, classifier))
-        ),
+        headline.FILE: headline.write(table.headlines(headlines.TASK, classifier.config["architecture"], questions)),
         "metrics.json": model_files.to_json(tree),
-        "confusion.csv": confusion_csv(
-            [sensor for sensor, _, _ in rows],
-            [classifier.naming.names_for(result.slides.materials[[index]])[0] for _, result, index in rows],
-            [classifier.naming.names_for(result.predicted[MODEL][[index]])[0] for _, result, index in rows],
-        ),
+        "confusion.csv": confusion_csv(unseen),
         **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    predicted = predictions_table(
-        evaluated, classifier, {name: labels.get("session") for name, labels in attributes.items()}
-    )
     return Result({PREDICTIONS: RecordingOutput(predicted, selection.combine_origins(attributes.values()))}, files)
 
 
@@ -195,28 +183,24 @@ def _evaluate_sensor(classifier: Classifier, slides: Slides, trained_on: set[str
     output = classifier.readers[sensor].read(slides.frames)
     predicted = {MODEL: classifier.best_classes(output.scores)}
     if sensor in classifier.last:
-        predicted[LAST_EPOCH] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
+        predicted[LAST] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
     params = classifier.params
     is_aligned = bool(params.aligned_sensor)  # all sensors already have the frozen sensor's classifier
     if classifier.config.get("joint") and output.latents is not None and not is_aligned:
         predicted[SWAPPED] = _exchanged_predictions(classifier, sensor, output.latents)
     for name, by_sensor in classifier.baselines.items():
         frames = slides.frames
-        if name != MEAN_LEVEL and output.latents is not None:
+        if name != LEVEL and output.latents is not None:
             frames = output.latents[:, None]
         fitted = by_sensor[sensor]
         predicted[name] = np.asarray(fitted.classes)[fitted.scores(frames).argmax(axis=1)].astype(np.int64)
     held_out = classifier.config.get("held_out", {}).get(sensor, [])
-    is_counted = np.ones(len(slides), bool)
-    if batch := params.dropped_beyond:
-        is_counted[len(slides) // batch * batch or len(slides) :] = False  # fewer slides than a batch are all counted
     evaluated = Evaluated(
         slides,
         np.array([digest in trained_on for digest in slides.digests], bool),
         output,
         predicted,
         np.isin(slides.materials, held_out),
-        counted=is_counted,
     )
     if held_out and output.latents is not None:
         evaluated.zero_shot = _zero_shot_predictions(classifier, sensor, output.latents, held_out)
@@ -251,34 +235,6 @@ def _zero_shot_predictions(
     scores = _partner_scores(classifier, sensor, latents)
     is_held_out = np.isin(classifier.classes, held_out)
     return classifier.best_classes(scores), classifier.best_classes(np.where(is_held_out, scores, -np.inf))
-
-
-def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> MaterialScores:
-    """Return the scores on the slides that were ``seen`` in training, or on the others, without held-out ones."""
-    masks = {
-        sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
-    }
-    predictors = sorted({name for result in evaluated.values() for name in result.predicted})
-    right = {
-        name: {
-            sensor: result.is_right(name, masks[sensor])
-            for sensor, result in evaluated.items()
-            if name in result.predicted
-        }
-        for name in predictors
-    }
-    return summary(right, len(classifier.classes))
-
-
-def _tables(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> dict[Question, ScoreTable]:
-    """Return the table of scores of each sensor's unseen slides."""
-    tables = {}
-    for sensor, result in evaluated.items():
-        mask = ~result.in_training & result.counted & ~result.held_out
-        slides = np.array(result.slides.names)[mask].tolist()
-        right = {name: dict(zip(slides, result.is_right(name, mask), strict=True)) for name in result.predicted}
-        tables[Question(headlines.sensor_title(sensor))] = headlines.score_table(right, len(classifier.classes))
-    return tables
 
 
 def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> ZeroShotAccuracy | None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from tacpipe.arrays import AnyArray, AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
-from tacpipe.io import Json
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed, plain
 from tacpipe.scores.calibration import ConfidenceBin
@@ -84,13 +83,6 @@ class SensorAccuracy(TypedDict):
     high: dict[str, float]
 
 
-class ChanceAccuracy(TypedDict):
-    """Accuracy of guessing by sensor."""
-
-    accuracy: dict[str, float]
-    n: dict[str, int]
-
-
 class HeldOutAccuracy(SensorAccuracy):
     """Accuracy on materials whose labels a sensor did not learn, and that of guessing."""
 
@@ -142,29 +134,8 @@ class UnknownMeasures(TypedDict):
     accuracy_of_answers: NotRequired[float]
 
 
-@dataclass(frozen=True)
-class MaterialScores:
-    """Accuracy of all predictors on a set of slides, by sensor."""
-
-    predictors: dict[str, SensorAccuracy]
-    chance: ChanceAccuracy
-    slides: dict[str, int]
-    skill: dict[str, float] | None  # fraction of the mean level's errors that the model corrects
-    mcnemar: dict[str, float] | None  # exact p-value of McNemar's test
-
-    def to_json(self) -> Json:
-        """Return the scores as they are stored in ``metrics.json``."""
-        compared = {"skill": self.skill, "mcnemar": {"model_vs_mean_level": self.mcnemar}}
-        return {
-            **self.predictors,
-            "chance": self.chance,
-            "counts": {"slides": self.slides},
-            **({} if self.skill is None else compared),
-        }
-
-
 class MaterialMetrics(TypedDict, total=False):
-    """Entries of ``metrics.json`` besides `MaterialScores`; entries without slides are omitted."""
+    """Entries of ``metrics.json`` besides accuracies; entries without slides are omitted."""
 
     calibration: dict[str, ProbabilityMeasures]  # sensor -> measures
     unknown: dict[str, UnknownMeasures]  # sensor -> measures

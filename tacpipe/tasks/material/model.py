@@ -14,7 +14,8 @@ from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.evaluation import PREDICTIONS, latent_columns, score_columns
+from tacpipe.tasks.material.evaluation import latent_columns, score_columns
+from tacpipe.tasks.material.predictions import PREDICTIONS
 from tacpipe.tasks.recordings import open_for_model
 
 

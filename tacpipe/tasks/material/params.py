@@ -97,11 +97,6 @@ class MaterialModelParams(ABC):
         `NetworkParams` implements it for the networks that an architecture builds.
         """
 
-    @property
-    def dropped_beyond(self) -> int:
-        """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
-        return 0
-
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
         """Return the fitted reader of each sensor. `NetworkParams` implements it.
 
@@ -242,11 +237,6 @@ class NetworkParams(MaterialModelParams, ABC):
     def readers(self, stored: StoredClassifier) -> dict[str, Reader]:
         """Return the networks by sensor."""
         return stored.networks(self)
-
-    @property
-    def dropped_beyond(self) -> int:
-        """Batch size if evaluation also omits slides beyond the last full batch; otherwise 0."""
-        return self.batch if self.drop_last else 0
 
     @property
     def learns_jointly(self) -> bool:

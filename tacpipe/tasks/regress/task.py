@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.constraints import CommaList
-from tacpipe.plugins.requirements import Channels, Label, Requirements
+from tacpipe.plugins.requirements import Channels, Requirements
 from tacpipe.plugins.stage import Result, Workspace, stage
-from tacpipe.tasks.learning.task import LearnedTask
+from tacpipe.tasks.learning.task import SESSION, TOUCH, LearnedTask
 from tacpipe.tasks.regress.params import Params
 from tacpipe.tasks.task import Demo
 
@@ -25,11 +25,7 @@ REQUIREMENTS = Requirements(
     ),
     roles="recordings with the role train",
     channels=(
-        Channels(
-            "tactile",
-            (),
-            "any number of columns, in rows at a nearly constant rate; others with --inputs",
-        ),
+        TOUCH,
         Channels(
             "any",
             (),
@@ -37,13 +33,7 @@ REQUIREMENTS = Requirements(
             "Without it, --target names labels of recordings that are numbers.",
         ),
     ),
-    labels=(
-        Label(
-            "session",
-            "any label, by --group and --recentre",
-            "Without --group, each recording is left out by itself in cross-validation.",
-        ),
-    ),
+    labels=(SESSION,),
 )
 
 

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypedDict
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray, Bools, Floats
+from tacpipe.arrays import AnyArray
 from tacpipe.channels import biotac_sp
-from tacpipe.datasets import selection
+from tacpipe.datasets import model_files, selection
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.io import Json, terminal
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.scores import headline, regression, table
 from tacpipe.scores.calibration import COVERAGE_FILE
-from tacpipe.scores.table import Question, ScoreTable
+from tacpipe.scores.table import Question
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import quantiles
@@ -35,102 +32,51 @@ from tacpipe.tasks.touch.headline import (
     PREDICTIONS,
     TRUE,
 )
+from tacpipe.tasks.touch.predictions import UNNAMED, GraspPredictions, Readings
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
 
-Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
-Scores = dict[str, float | None]  # values by name; None if a measure is undefined
 
-
-class ReadingMeasures(TypedDict):
-    """The errors of a predictor, by target."""
-
-    rmse: Scores
-    rmse_counts: Scores
-    rmse_batch_mean: Scores
-    mae: Scores
-    r2: Scores
-    skill: Scores
-    skill_low: Scores
-    skill_high: Scores
-    n: int  # number of grasps
-
-
-class PredictorMeasures(ReadingMeasures):
-    """The errors of a predictor, over all grasps and by object."""
-
-    by_object: dict[str, ReadingMeasures]
-
-
-class ModelMeasures(PredictorMeasures):
-    """The errors of the model itself."""
-
-    by_electrode: dict[str, dict[str, Scores]]  # target -> electrode -> measure -> value
-
-
-@dataclass(frozen=True)
-class TouchScores:
-    """The errors of all predictors on a set of grasps."""
-
-    counts: dict[str, int]
-    predictors: dict[str, PredictorMeasures] = field(default_factory=dict)
-
-    def to_json(self) -> Json:
-        """Return the scores as they are stored in ``metrics.json``."""
-        return {"counts": self.counts, **self.predictors}
-
-
-def reading_measures(
-    readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]
-) -> ReadingMeasures:
-    """Return the errors of one predictor, by measure and target.
+def reading_measures(grasps: GraspPredictions, predictor: str, clusters: AnyArray) -> dict[str, Any]:
+    """Return the errors of one predictor, by measure and target, and the number ``n`` of grasps; undefined ones are None.
 
     ``rmse`` and ``mae`` are fractions of each target's range (`biotac_sp.RANGES`), pooled over grasps and electrodes.
     ``rmse_counts`` is in device counts. ``rmse_batch_mean`` is the figure of the letter: the mean over batches of ten.
-    ``skill`` is 1 - RMSE / RMSE of ``constant``, with a 95 % interval over ``clusters``.
+    ``skill`` is 1 - RMSE / RMSE of the constant, with a 95 % interval over ``clusters`` (grasp,).
     """
-    measures: ReadingMeasures = {
-        "rmse": {},
-        "rmse_counts": {},
-        "rmse_batch_mean": {},
-        "mae": {},
-        "r2": {},
-        "skill": {},
-        "skill_low": {},
-        "skill_high": {},
-        "n": len(clusters),
-    }
-    for target, values in predicted.items():
-        true, model_share, constant_share = (
-            biotac_sp.normalise(target, counts[target]) for counts in (readings, predicted, constant)
-        )
-        measures["rmse"][target] = regression.rmse(true, model_share)
-        measures["rmse_counts"][target] = regression.rmse(readings[target], values)
-        measures["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, model_share)
-        measures["mae"][target] = regression.mae(true, model_share)
-        measures["r2"][target] = _finite(regression.r2(true, model_share))
-        model, baseline = (regression.squared_sums(true, share) for share in (model_share, constant_share))
-        skill, low, high = map(_finite, regression.skill_interval(model, baseline, np.asarray(clusters)))
-        measures["skill"][target], measures["skill_low"][target], measures["skill_high"][target] = skill, low, high
+    measures: dict[str, Any] = {"n": len(grasps)}
+    for target in grasps.targets:
+        counts = (grasps.true[target], *(grasps.predicted[name][target] for name in (predictor, CONSTANT)))
+        true, model, constant = (biotac_sp.normalise(target, values) for values in counts)
+        model_sums, constant_sums = (regression.squared_sums(true, share) for share in (model, constant))
+        skill, low, high = regression.skill_interval(model_sums, constant_sums, clusters)
+        values = {
+            "rmse": regression.rmse(true, model),
+            "rmse_counts": regression.rmse(*counts[:2]),
+            "rmse_batch_mean": regression.batch_mean_rmse(true, model),
+            "mae": regression.mae(true, model),
+            "r2": regression.r2(true, model),
+            "skill": skill,
+            "skill_low": low,
+            "skill_high": high,
+        }
+        for name, value in values.items():
+            measures.setdefault(name, {})[target] = _finite(value)
     return measures
 
 
-def by_electrode(readings: Readings, predicted: Readings) -> dict[str, dict[str, Scores]]:
-    """Return RMSE (fraction of the range) and R2 of each electrode, by target."""
+def by_electrode(grasps: GraspPredictions) -> dict[str, dict[str, Any]]:
+    """Return the model's RMSE (fraction of the range) and R2 of each electrode, by target."""
     by_target = {}
-    for target, values in predicted.items():
+    for target in grasps.targets:
         if biotac_sp.width(target) > 1:
-            true, share = (biotac_sp.normalise(target, counts) for counts in (readings[target], values))
+            counts = grasps.true[target], grasps.predicted[MODEL][target]
+            true, share = (biotac_sp.normalise(target, values) for values in counts)
             pairs = zip(regression.rmse_by_value(true, share), regression.r2_by_value(true, share), strict=True)
             by_target[target] = {
                 f"{number:02d}": {"rmse": float(rmse), "r2": _finite(float(r2))}
                 for number, (rmse, r2) in enumerate(pairs, 1)
             }
     return by_target
-
-
-def select_rows(predicted: Readings, mask: Bools) -> dict[str, Floats]:
-    """Return the values of the grasps selected by a mask (grasp,)."""
-    return {target: values[mask] for target, values in predicted.items()}
 
 
 def _finite(value: float) -> float | None:
@@ -179,28 +125,27 @@ def _evaluation_result(
         [digest in trained for digest in grasps.digests], bool
     ) | predictor.baselines.has_training_reading(grasps)
     is_known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
-    fresh = _scores(grasps, predicted, ~in_training, is_known)
-    masks = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training, "seen": in_training}
-    quantile_measures = _quantiles(predictor, grasps, predicted, in_training, is_known)
+    rows = GraspPredictions(np.array(grasps.names), np.array(grasps.objects), is_known, grasps.readings, predicted)
+    unseen = rows.rows(~in_training)
+    parts = {"known": unseen.rows(unseen.known), "novel": unseen.rows(~unseen.known), "seen": rows.rows(in_training)}
+    fresh, quantile_measures = _scores(unseen), _quantiles(predictor, parts)
     tree = {
-        **fresh.to_json(),
-        **{name: _scores(grasps, predicted, mask, is_known).to_json() for name, mask in masks.items() if mask.any()},
+        **fresh,
+        **{name: _scores(part) for name, part in parts.items() if len(part)},
         **({"quantiles": quantile_measures} if quantile_measures else {}),
     }
+    tables = {
+        Question(headlines.PARTS[known_objects], headlines.TARGETS[target]): scored
+        for (known_objects, target), scored in unseen.tables().items()
+    }
     files = {
-        headline.FILE: headline.write(
-            table.headlines(
-                headlines.TASK,
-                predictor.config["architecture"],
-                _tables(predictor, grasps, predicted, in_training, is_known),
-            )
-        ),
+        headline.FILE: headline.write(table.headlines(headlines.TASK, predictor.config["architecture"], tables)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _object_csv(fresh),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     if predictor.quantiles is not None:
-        files[COVERAGE_FILE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
+        files[COVERAGE_FILE] = quantiles.coverage(predictor.quantiles, unseen)
     streams[GRASPS] = pa.table(
         {
             "recording": pa.array(grasps.names, pa.string()),
@@ -215,89 +160,57 @@ def _evaluation_result(
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
 
-def _quantiles(
-    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
-) -> Json:
+def _quantiles(predictor: Predictor, parts: Mapping[str, GraspPredictions]) -> Json:
     """Return the quantile measures of a calibrated model on known and on novel objects; empty for other models."""
     if predictor.quantiles is None:
         return {}
-    parts = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training}
-    clusters = {"known": grasps.names, "novel": grasps.objects}
+    clusters = {"known": parts["known"].recordings, "novel": parts["novel"].objects}
     measures = {
         name: {
-            "n": int(mask.sum()),
-            **quantiles.measures_by_predictor(predictor.quantiles, grasps, predicted, mask, clusters[name]),
+            "n": len(parts[name]),
+            **quantiles.measures_by_predictor(predictor.quantiles, parts[name], by_grasp),
         }
-        for name, mask in parts.items()
-        if mask.any()
+        for name, by_grasp in clusters.items()
+        if len(by_grasp)
     }
     return {**predictor.config["quantiles"], **measures}
 
 
-def _tables(
-    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
-) -> dict[Question, ScoreTable]:
-    """Return the table of scores of each target, on known and on novel objects."""
-    objects = {name: object_name or "unnamed" for name, object_name in zip(grasps.names, grasps.objects, strict=True)}
-    tables = {}
-    for known_objects in (True, False):
-        rows = np.flatnonzero((is_known == known_objects) & ~in_training)
-        names = [grasps.names[row] for row in rows]
-        for target in predictor.targets:
-            readings = {name: values[target][rows] for name, values in predicted.items()}
-            tables[Question(headlines.PARTS[known_objects], headlines.TARGETS[target])] = headlines.score_table(
-                target, grasps.readings[target][rows], readings, names, objects, known_objects=known_objects
-            )
-    return tables
+def _scores(grasps: GraspPredictions) -> dict[str, Any]:
+    """Return the errors of every predictor, in total and by object, as ``metrics.json`` contains them.
 
-
-def _scores(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> TouchScores:
-    """Return the errors of every predictor on the grasps selected by ``mask`` (grasp,), in total and by object.
-
-    Intervals resample objects if any object is novel, otherwise grasps. ``is_known`` (grasp,) marks known objects.
+    Intervals resample objects if any object is novel, otherwise grasps. The model has errors by electrode, too.
     """
-    if not mask.any():
-        return TouchScores({"grasps": 0})
-    names, objects = np.array(grasps.names), np.array(grasps.objects)
-    clusters = objects if (mask & ~is_known).any() else names
-    constant = predicted[CONSTANT]
-    predictors: dict[str, PredictorMeasures] = {
+    if not len(grasps):
+        return {"counts": {"grasps": 0}}
+    clusters = grasps.recordings if grasps.known.all() else grasps.objects
+    by_object = {name: grasps.rows(grasps.objects == name) for name in sorted(set(grasps.objects.tolist()))}
+    predictors = {
         name: {
-            **_measures(grasps, readings, constant, mask, clusters),
+            **reading_measures(grasps, name, clusters),
             "by_object": {
-                object_name or "unnamed": _measures(grasps, readings, constant, mask & (objects == object_name), names)
-                for object_name in sorted(set(objects[mask]))
+                own or UNNAMED: reading_measures(rows, name, rows.recordings) for own, rows in by_object.items()
             },
         }
-        for name, readings in predicted.items()
+        for name in grasps.predicted
     }
-    readings, model = (select_rows(values, mask) for values in (grasps.readings, predicted[MODEL]))
-    own_measures: ModelMeasures = {**predictors[MODEL], "by_electrode": by_electrode(readings, model)}
-    predictors[MODEL] = own_measures
-    return TouchScores({"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}, predictors)
+    predictors[MODEL]["by_electrode"] = by_electrode(grasps)
+    return {"counts": {"grasps": len(grasps), "objects": len(by_object)}, **predictors}
 
 
-def _measures(
-    grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray
-) -> ReadingMeasures:
-    readings, model, mean = (select_rows(values, mask) for values in (grasps.readings, predicted, constant))
-    return reading_measures(readings, model, mean, clusters[mask].tolist())
+OBJECT_MEASURES = ("rmse", "rmse_counts", "r2", "skill")
 
 
-def _object_csv(scores: TouchScores) -> bytes:
+def _object_csv(scores: Json) -> bytes:
     """Return CSV with one row per object, predictor and target: grasps, relative RMSE, RMSE in counts, R2 and skill."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
+    rows = []
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
-        by_object = scores.predictors[predictor]["by_object"] if predictor in scores.predictors else {}
-        for name, measures in by_object.items():
+        for name, measures in scores.get(predictor, {"by_object": {}})["by_object"].items():
             for target in measures["rmse"]:
-                scored = (measures["rmse"], measures["rmse_counts"], measures["r2"], measures["skill"])
-                values = [by_target[target] for by_target in scored]
+                values = [measures[measure][target] for measure in OBJECT_MEASURES]
                 rounded = ["" if value is None else f"{value:.6g}" for value in values]
-                writer.writerow([name, predictor, target, measures["n"], *rounded])
-    return text.getvalue().encode()
+                rows.append([name, predictor, target, measures["n"], *rounded])
+    return model_files.to_csv(("object", "predictor", "target", "n", *OBJECT_MEASURES), rows)
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:

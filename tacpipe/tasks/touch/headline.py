@@ -8,7 +8,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.channels import biotac_sp
-from tacpipe.scores import regression
+from tacpipe.scores import intervals, regression
 from tacpipe.scores.pairing import Measure
 from tacpipe.scores.table import MODEL as MODEL
 from tacpipe.scores.table import ScoreTable
@@ -62,9 +62,6 @@ def measure(range_counts: float, cluster: str) -> Measure:
     def rmse(sums: AnyFloats) -> AnyFloats:
         return np.sqrt(np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1), np.nan))
 
-    def gain(error: AnyFloats, baseline: AnyFloats) -> AnyFloats:
-        return np.where(baseline > 0, 1 - error / np.where(baseline > 0, baseline, 1), np.nan)
-
     def values(sums: AnyFloats) -> tuple[float, ...]:
         share = float(rmse(sums[None])[0])
         return share, share * range_counts
@@ -78,7 +75,7 @@ def measure(range_counts: float, cluster: str) -> Measure:
         "skill",
         cluster,
         rmse,
-        gain,
+        intervals.skill,
         values,
         scored="RMSE (fraction of the range)",
         weight=lambda draws: draws[:, 0],

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from safetensors.numpy import save
@@ -25,12 +25,12 @@ from tacpipe.scores.calibration import Sums
 from tacpipe.tasks import task
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.predictions import GraspPredictions, Readings
 
 FILE = "calibration.safetensors"
 LEVELS = "levels"
 MEAN = "mean"
 
-Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
 Offsets = Mapping[str, Floats]  # target -> (level, value), device counts
 
 
@@ -96,51 +96,44 @@ class ReadingQuantiles:
 
 
 def measures_by_predictor(
-    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, clusters: Sequence[str]
+    fitted: ReadingQuantiles, grasps: GraspPredictions, clusters: AnyArray
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return quantile measures of the grasps selected by ``mask`` (grasp,), by predictor, measure and target.
+    """Return quantile measures of grasps, by predictor, measure and target.
 
     ``pinball`` and ``width`` are in device counts. The interval of ``coverage`` is over ``clusters`` (grasp,), and
     ``pinball_skill`` is relative to the constant with its empirical quantiles.
     """
     measures: dict[str, dict[str, dict[str, float]]] = {}
-    names = np.asarray(clusters)[mask]
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
-        for target in predicted[MODEL]:
-            sums, constant_sums = (
-                _sums(fitted, grasps, predicted, (name, target), mask, names) for name in (predictor, CONSTANT)
-            )
+        for target in grasps.targets:
+            sums, constant_sums = (_sums(fitted, grasps, name, target, clusters) for name in (predictor, CONSTANT))
             for measure, values in calibration.measures_by_step(sums, fitted.percents, constant_sums).items():
                 if MEAN in values:
                     measures.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
     return measures
 
 
-def coverage(
-    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools
-) -> bytes:
-    """Return ``coverage.parquet`` with one row per grasp selected by ``mask`` (grasp,), predictor and value.
+def coverage(fitted: ReadingQuantiles, grasps: GraspPredictions) -> bytes:
+    """Return ``coverage.parquet`` with one row per grasp, predictor and value.
 
     Columns: whether the true value is in the band from the lowest to the highest quantile, and the width and pinball
-    loss of the band in device counts. ``is_known`` (grasp,) marks grasps of known objects.
+    loss of the band in device counts.
     """
     import pyarrow as pa
 
-    names, objects = (np.asarray(labels)[mask] for labels in (grasps.names, grasps.objects))
     parts = []
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
-        for target, values in predicted[predictor].items():
-            bands = fitted.quantiles({target: values[mask]}, predictor)[target]  # (grasp, value, level)
-            truth = grasps.readings[target][mask]
+        for target, bands in fitted.quantiles(grasps.predicted[predictor], predictor).items():  # (grasp, value, level)
+            truth = grasps.true[target]
             above = truth[..., None] - bands
             lost = calibration.pinball(above, fitted.levels).mean(axis=2)
             count = truth.shape[1]
             parts.append(
                 pa.table(
                     {
-                        "recording": np.repeat(names, count),
-                        "object": np.repeat(objects, count),
-                        "known": np.repeat(is_known[mask], count),
+                        "recording": np.repeat(grasps.recordings, count),
+                        "object": np.repeat(grasps.objects, count),
+                        "known": np.repeat(grasps.known, count),
                         "predictor": [predictor] * truth.size,
                         "target": [target] * truth.size,
                         "value": np.tile(np.arange(1, count + 1, dtype=np.int32), len(truth)),
@@ -154,17 +147,11 @@ def coverage(
 
 
 def _sums(
-    fitted: ReadingQuantiles,
-    grasps: Grasps,
-    predicted: Mapping[str, Readings],
-    predictor_and_target: tuple[str, str],
-    mask: Bools,
-    clusters: np.ndarray[Any, np.dtype[np.str_]],
+    fitted: ReadingQuantiles, grasps: GraspPredictions, predictor: str, target: str, clusters: AnyArray
 ) -> list[Sums]:
     """Return the sums over the values of each cluster of grasps, for a predictor and target."""
-    predictor, target = predictor_and_target
-    bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
-    truth = grasps.readings[target][mask]
+    truth = grasps.true[target]
+    bands = fitted.quantiles({target: grasps.predicted[predictor][target]}, predictor)[target]
     return [
         Sums.from_predictions(
             truth[in_cluster].reshape(-1, 1), bands[in_cluster].reshape(-1, 1, bands.shape[2]), fitted.levels

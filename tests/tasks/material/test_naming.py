@@ -8,10 +8,11 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.material import model as material_prediction
+from tacpipe.tasks.material import predictions
 from tacpipe.tasks.material.headline import UNKNOWN, Naming
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.params import StoredNaming
-from tacpipe.tasks.material.report import pictures, predictions
+from tacpipe.tasks.material.report import pictures
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained

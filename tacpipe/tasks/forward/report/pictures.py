@@ -20,7 +20,6 @@ from tacpipe.scores.intervals import Interval
 from tacpipe.scores.pairing import Sums
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE, Parts
-from tacpipe.tasks.forward.report import methods
 from tacpipe.tasks.forward.report.methods import ComparedRun
 
 if TYPE_CHECKING:
@@ -49,8 +48,8 @@ def sums_of_row(row: ComparisonRow, question: Question, steps: Sequence[int], gr
     known_objects, predictor = known_objects_of(question), row.predictor.split(" ")[0]
     parts = []
     for run in row.method.runs:
-        clusters = methods.object_clusters(run.details, known_objects) or {}
-        sums = methods.sums_by_recording(run.details, predictor, steps, known_objects, group)
+        clusters = run.details.errors.clusters(known_objects) or {}
+        sums = run.details.errors.by_recording(predictor, steps, known_objects, group)
         parts += [((run.seed, clusters.get(name, name)), errors) for name, errors in sums.items()]
     return pairing.add_by_key(parts)
 

@@ -21,9 +21,9 @@ from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.live import LATENCY
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.evaluation import PREDICTIONS
 from tacpipe.tasks.material.live.messages import MATERIAL, MIN_SEEN
 from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, slide_params
+from tacpipe.tasks.material.predictions import PREDICTIONS
 
 if TYPE_CHECKING:
     Tables = Mapping[str, pa.Table]

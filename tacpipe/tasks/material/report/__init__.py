@@ -10,9 +10,9 @@ from tacpipe.comparison.runs import Kind, RecordingOutcome
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.report.blocks import NONE, Cell, Fold
 from tacpipe.report.context import Context, TaskReport
+from tacpipe.tasks.material.predictions import MODEL
 from tacpipe.tasks.material.report import methods, pictures
 from tacpipe.tasks.material.report.methods import ComparedRun
-from tacpipe.tasks.material.report.predictions import MODEL
 
 
 class MaterialReport(TaskReport):

@@ -13,10 +13,9 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import SHORTENED, drop_duplicates
-from tacpipe.tasks.material import headline
+from tacpipe.tasks.material import headline, predictions
 from tacpipe.tasks.material.headline import MaterialMetrics, sensor_title
 from tacpipe.tasks.material.params import MaterialConfig, Params
-from tacpipe.tasks.material.report import predictions
 
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that names do not mark
 _COMPETING = {  # settings of methods that compete: trained on all materials and slides, with true labels and pairs
@@ -212,23 +211,14 @@ def question_on(run: ComparedRun, sensor: str) -> Question | None:
     return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
 
 
-def right_by_recording(result: MaterialResult, sensor: str, predictor: str) -> dict[str, bool]:
-    """Return whether the material of each slide of a sensor is right, by recording."""
-    rows = result.predictions
-    rows = rows[(rows["sensor"] == sensor) & rows[predictor].notna()]
-    return dict(zip(rows["recording"], rows[predictor] == rows["material"], strict=True))
-
-
 def _run(result: MaterialResult, settings: Settings) -> ComparedRun:
     """Return the run of a result: per sensor, the numbers of correct slides of each predictor."""
     place = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
     classes = len(result.config.get("classes", ()))
     questions = {}
-    for sensor in result.sensors:
-        predictors = [name for name in predictions.PREDICTORS if name in result.predictions]
-        right = {name: right_by_recording(result, sensor, name) for name in predictors}
+    for sensor, scored in predictions.score_tables(result.predictions, result.sensors, classes).items():
         part = ", ".join(filter(None, (sensor_title(sensor), place)))
-        questions[Question(part, place=int(settings["elsewhere"]))] = headline.score_table(right, classes)
+        questions[Question(part, place=int(settings["elsewhere"]))] = scored
     return ComparedRun(
         result.dataset,
         headline.TASK,

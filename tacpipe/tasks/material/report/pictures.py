@@ -18,8 +18,8 @@ from tacpipe.report.context import Context, median_run
 from tacpipe.scores.intervals import Estimate, wilson
 from tacpipe.tasks.material.headline import HeldOutAccuracy, ProbabilityMeasures, sensor_title
 from tacpipe.tasks.material.params import KEY
+from tacpipe.tasks.material.predictions import MODEL
 from tacpipe.tasks.material.report.methods import Method, question_on, runs_on, sensors_of
-from tacpipe.tasks.material.report.predictions import MODEL
 
 
 def confusion_folds(context: Context) -> list[Fold]:

@@ -11,6 +11,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
 from tacpipe.report.blocks import Fold
+from tacpipe.tasks.forward.metrics import ErrorSums
 from tacpipe.tasks.forward.report import methods
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -21,7 +22,7 @@ WINDOW_COUNTS = {"r1": 10, "r2": 30}
 
 
 def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
-    sums_read = methods.read_error_sums(errors(RATIOS, WINDOW_COUNTS, known_objects_of=["r2"]))
+    sums_read = ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS, known_objects_of=["r2"]))
     assert sums_read.recordings == ("r1", "r2")
     assert sums_read.steps == (1, 2, 3)
     assert sums_read.known.tolist() == [False, True]
@@ -35,9 +36,15 @@ def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
     assert sums[1].tolist() == (2 * sums[0]).tolist()
 
 
+def test_the_mean_error_weighs_windows_and_not_recordings() -> None:
+    squared, absolute = ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS)).means("model", "x")
+    assert squared == pytest.approx([(0.5 * 10 + 0.25 * 30) / 40 * step for step in (1, 2, 3)])
+    assert absolute == pytest.approx(2 * squared)
+
+
 def test_recordings_that_were_trained_on_are_left_out() -> None:
-    assert methods.read_error_sums(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1"])).recordings == ("r2",)
-    empty = methods.read_error_sums(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1", "r2"]))
+    assert ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1"])).recordings == ("r2",)
+    empty = ErrorSums.from_parquet(errors(RATIOS, WINDOW_COUNTS, seen_recordings=["r1", "r2"]))
     assert (empty.recordings, empty.steps, empty.predictors) == ((), (), ())
 
 
@@ -46,7 +53,7 @@ def test_a_predictor_that_lacks_a_group_has_no_errors_there() -> None:
     lacking = [not (row["predictor"] == "model" and row["group"] == "feature") for row in table.to_pylist()]
     content = io.BytesIO()
     pq.write_table(table.filter(lacking), content)
-    sums_read = methods.read_error_sums(content.getvalue())
+    sums_read = ErrorSums.from_parquet(content.getvalue())
     assert ("model", "feature") not in sums_read.sums
     assert ("persistence", "feature") in sums_read.sums
 
@@ -56,13 +63,13 @@ def test_a_missing_column_and_uneven_windows_are_refused() -> None:
     content = io.BytesIO()
     pq.write_table(table.drop_columns(["known"]), content)
     with pytest.raises(TacpipeError, match="has no column known"):
-        methods.read_error_sums(content.getvalue())
+        ErrorSums.from_parquet(content.getvalue())
     rows = table.to_pylist()
     rows[0]["windows"] = 11
     content = io.BytesIO()
     pq.write_table(table.from_pylist(rows), content)
     with pytest.raises(TacpipeError, match="different windows of r1"):
-        methods.read_error_sums(content.getvalue())
+        ErrorSums.from_parquet(content.getvalue())
 
 
 PREDICTORS = {"model": (8.0, 4.0), "persistence": (6.0, 5.0)}  # sums over ten values: covered, and pinball loss

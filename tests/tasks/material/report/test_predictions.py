@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from tacpipe.tasks.material.report import predictions
+from tacpipe.tasks.material import predictions
 from tests.tasks.material.report.material_fakes import result
 
 BOTH = {"biotac": 1, "roboskin": 2}

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.channels import biotac_sp
-from tacpipe.tasks.touch.report.methods import read_predictions
+from tacpipe.tasks.touch.predictions import read_predictions
 from tests.tasks.touch.report.touch_fakes import KNOWN, PER_OBJECT, result
 
 
