@@ -222,6 +222,7 @@ def test_a_recording_without_contact_has_a_note_with_thresholds_and_largest_load
     quiet = table([0.0, 50.0] * 50)
     (note,) = segment(segment.params(), shard({"": quiet})).notes
     assert "no contact of 0.3 s or more was found in this recording" in note
+    assert note.endswith("If it was touched in the first 0.2 s, give --rest lowest.")
     assert "xela1 starts contact at a load of 120 count and reaches 50 count. " in note
     assert "--on-count" in note and "--thresholds noise" in note
     (note,) = segment(segment.params(on_level=1.0), shard({"": in_unit(quiet, "N", 0.01)})).notes
