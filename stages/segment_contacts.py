@@ -236,7 +236,9 @@ def _no_contact_note(
     names = ["--on-count"] * bool(fixed) + ["--on-level"] * (set(fixed) != set(units))
     alternative = ", or give --thresholds noise" if fixed else ""
     # a contact within rest_s becomes the level at rest, and its change the noise
-    touched_first = f" If it was touched in the first {params.rest_s:g} s, give --rest lowest." * (params.rest == "start")
+    touched_first = f" If it was touched in the first {params.rest_s:g} s, give --rest lowest." * (
+        params.rest == "start"
+    )
     return (
         f"no contact of {params.min_s:g} s or more was found in this recording: {'; '.join(descriptions)}. If something was "
         f"touched, lower {' and '.join(names)}{alternative}.{touched_first}"
