@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypedDict
 
@@ -350,6 +350,22 @@ def interval(mean: float, low: float, high: float, digits: int = 3) -> Cell:
     ends = signed(low, digits), signed(high, digits)
     below = "" if NONE in ends or ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
     return Cell(signed(mean, digits), below, mean)
+
+
+def estimate(values: Iterable[float | None], digits: int, basis: str = "", factor: float = 1.0) -> Cell:
+    """Return a value with this many decimals, and below it its interval, unless that is a point or NaN, and its ``basis``.
+
+    ``values`` are mean, low and high, to be multiplied by ``factor``; None is NaN. "–" if the mean is NaN.
+
+    >>> estimate((0.95, 0.91, 0.97), 1, "190/200", 100)
+    Cell(text='95.0', below='91.0 to 97.0, 190/200', value=95.0, copy='')
+    """
+    mean, low, high = (math.nan if value is None else factor * value for value in values)
+    if math.isnan(mean):
+        return Cell(NONE)
+    ends = fixed(low, digits), fixed(high, digits)
+    between = "" if NONE in ends or ends[0] == ends[1] else " to ".join(ends)
+    return Cell(fixed(mean, digits), ", ".join(filter(None, (between, basis))), mean)
 
 
 def p_value(p: float) -> Cell:

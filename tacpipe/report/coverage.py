@@ -8,12 +8,11 @@ from typing import Any
 from tacpipe.comparison.runs import MODEL, ComparedRun
 from tacpipe.io.parquet import from_parquet
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, Table, fixed, fold, notes, number, table
+from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, Table, estimate, fold, notes, number, table
 from tacpipe.report.charts import Dot
 from tacpipe.report.context import Context, read_json
 from tacpipe.scores import calibration
 from tacpipe.scores.calibration import COVERAGE_FILE
-from tacpipe.scores.intervals import Estimate
 
 HEADS = ("", "values", "coverage (%)", "width", "pinball loss", "pinball loss below the baseline's (%)")
 NOTE = (
@@ -70,10 +69,10 @@ def coverage_folds(
                         [
                             f"{title}: {name}",
                             f"{band.values:,}",
-                            _percent_cell(band.coverage),
+                            estimate(band.coverage, 0, factor=100),
                             number(band.width, 3),
                             number(band.pinball, 3),
-                            NONE if predictor == baseline else _percent_cell(band.gain),
+                            NONE if predictor == baseline else estimate(band.gain, 0, factor=100),
                         ]
                     )
             level = {title: float(levels[1] - levels[0]) for title in titles.values()}
@@ -88,10 +87,3 @@ def _outer_levels(runs: Sequence[ComparedRun]) -> tuple[int, int]:
     """Return the lowest and the highest level in percent of the first run's quantiles."""
     levels = read_json(runs[0].dataset, "config.json")["quantiles"]["levels"]
     return levels[0], levels[-1]
-
-
-def _percent_cell(fractions: Estimate) -> Cell:
-    """Return a fraction in percent above its interval, if it has one."""
-    mean, low, high = (100 * fraction for fraction in fractions)
-    ends = fixed(low, 0), fixed(high, 0)
-    return Cell(fixed(mean, 0), "" if NONE in ends or ends[0] == ends[1] else " to ".join(ends), mean)

@@ -6,7 +6,7 @@ cursor, the legend shows and hides lines, and axes zoom with Shift and the wheel
 
 from tacpipe.report.blocks import DataRow, Spec
 from tacpipe.report.charts.curves import POINTS, Curve, decimated, explain_lines, lines
-from tacpipe.report.charts.points import Dot, matrix, ranking, scatter
+from tacpipe.report.charts.points import Dot, confusions, matrix, ranking, scatter
 
 __all__ = [
     "POINTS",
@@ -14,6 +14,7 @@ __all__ = [
     "DataRow",
     "Dot",
     "Spec",
+    "confusions",
     "decimated",
     "explain_lines",
     "lines",

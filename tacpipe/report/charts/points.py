@@ -212,6 +212,18 @@ def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
+def confusions(title: str, counts: Ints, names: Sequence[str], label: str, rows: str) -> blocks.Chart:
+    """Return a chart of the confusion `matrix` of named classes of a ``label``; ``rows`` says of what."""
+    spec = matrix(counts, names, label, "named")
+    spec["usermeta"] = {"most": 150 + 30 * len(names)}
+    wrong = "; orange: wrong" if counts.trace() < counts.sum() else ""
+    caption = (
+        f"{counts.trace():,} of {counts.sum():,} {rows} are right. Blue: right{wrong}. The intensity is the fraction of a "
+        "class."
+    )
+    return blocks.Chart(title, spec, caption)
+
+
 def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> blocks.Spec:
     """Return a confusion matrix: a square per pair of true and predicted class that occurs, mistakes in another colour.
 
@@ -234,7 +246,7 @@ def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> blocks
               "axis": axis},
         "x": {"field": "column", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": across,
               "axis": {**axis, "labelAngle": 0 if max(map(len, names), default=0) < 4 else -90}},
-        "tooltip": [tip_of("row", down), tip_of("column", across), tip_of("count", "slides"),
+        "tooltip": [tip_of("row", down), tip_of("column", across), tip_of("count", "number"),
                     tip_of("fraction", "fraction")],
     }  # fmt: skip
     colour: blocks.ChartChannel = {

@@ -147,13 +147,7 @@ def _confusions(answered: Answered) -> Charts:
     labels, best = answered.true[:, 0].astype(np.int64), answered.predicted[MODEL].argmax(axis=1)
     counts = np.zeros((len(names), len(names)), np.int64)
     np.add.at(counts, (labels[labels >= 0], best[labels >= 0]), 1)
-    spec = charts.matrix(counts, list(names), answered.answers.label, "named")
-    spec["usermeta"] = {"most": 150 + 30 * len(names)}
-    caption = (
-        f"{counts.trace():,} of {counts.sum():,} test windows are right. Blue: right; orange: wrong. The intensity is the "
-        f"fraction of the windows of a class."
-    )
-    return Charts([Chart("", spec, caption)])
+    return Charts([charts.confusions("", counts, list(names), answered.answers.label, "test windows")])
 
 
 def _importance(metrics: dict[str, Any]) -> Block | None:

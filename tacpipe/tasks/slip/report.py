@@ -8,7 +8,7 @@ from typing import Any
 
 from tacpipe.comparison.runs import ComparedRun, Method
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.report.blocks import NONE, Cell, Fold, fixed, fold, notes, table
+from tacpipe.report.blocks import NONE, Cell, Fold, estimate, fold, notes, table
 from tacpipe.report.context import Context, TaskReport
 from tacpipe.scores.table import MODEL
 from tacpipe.tasks.slip.evaluation import EVENTS, WINDOWS, EvaluatedSlips, questions
@@ -104,10 +104,5 @@ def alarm_table(measured: Mapping[str, Any]) -> Any:
     return table("Alarms", ["set for, per minute", *ALARM_HEADS.values()], rows)
 
 
-def _estimate(estimate: ObjectEstimate) -> str | Cell:
-    """Return a cell with an estimate and its interval below, without the parts that are null."""
-    value, low, high = estimate["value"], estimate["low"], estimate["high"]
-    if value is None:
-        return NONE
-    below = "" if low is None or high is None or low == high else f"{fixed(low, 2)} to {fixed(high, 2)}"
-    return Cell(fixed(value, 2), below, value)
+def _estimate(measured: ObjectEstimate) -> Cell:
+    return estimate((measured["value"], measured["low"], measured["high"]), 2)

@@ -12,10 +12,10 @@ import pandas as pd
 from tacpipe.arrays import Ints
 from tacpipe.printable import format_count
 from tacpipe.report import charts
-from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fixed, fold, notes, number, table
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, estimate, fixed, fold, notes, number, table
 from tacpipe.report.charts import Curve
 from tacpipe.report.context import Context, median_run
-from tacpipe.scores.intervals import Estimate, wilson
+from tacpipe.scores.intervals import wilson
 from tacpipe.tasks.material.headline import HeldOutAccuracy, ProbabilityMeasures, sensor_title
 from tacpipe.tasks.material.params import KEY
 from tacpipe.tasks.material.predictions import MODEL
@@ -43,16 +43,9 @@ def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | lis
 def _confusion_chart(method: Method, sensor: str) -> Chart:
     """Return the confusion matrix of a method on a sensor's slides."""
     counts, materials = count_confusions(method, sensor)
-    names = [str(material) for material in materials]
-    spec = charts.matrix(counts, names, method.details[0].config.get("label", KEY), "named")
-    spec["usermeta"] = {"most": 150 + 30 * len(names)}
-    wrong = "; orange: wrong" if counts.trace() < counts.sum() else ""
-    runs = format_count(len(runs_on(method, sensor)), "runs")
-    caption = (
-        f"{counts.trace()} of {counts.sum()} answers on unseen slides are right ({runs}). Blue: right{wrong}. The "
-        "intensity is the fraction of the slides of a material."
-    )
-    return Chart(f"{sensor_title(sensor)}: {method.name}", spec, caption)
+    rows = f"answers on unseen slides of {format_count(len(runs_on(method, sensor)), 'runs')}"
+    label = method.details[0].config.get("label", KEY)
+    return charts.confusions(f"{sensor_title(sensor)}: {method.name}", counts, list(map(str, materials)), label, rows)
 
 
 ZERO_SHOT_NOTE = (
@@ -106,21 +99,9 @@ def _zero_shot_cells(results: Sequence[HeldOutAccuracy], sensor: str, materials:
     fraction = correct / evaluated
     chance = float(np.mean([result["chance"][sensor] for result in results]))
     return [
-        percent_cell(Estimate(fraction, *wilson(round(fraction * materials), materials)), f"{correct}/{evaluated}"),
+        estimate((fraction, *wilson(round(fraction * materials), materials)), 1, f"{correct}/{evaluated}", 100),
         fixed(100 * chance, 1),
     ]
-
-
-def percent_cell(fraction: Estimate, basis: str) -> Cell:
-    """Return a fraction in percent above its interval and its basis; "–" for NaN.
-
-    >>> percent_cell(Estimate(0.95, 0.91, 0.97), "190/200")
-    Cell(text='95.0', below='91.0 to 97.0, 190/200', value=0.95, copy='')
-    """
-    if math.isnan(fraction.mean):
-        return Cell(NONE)
-    ends = "" if math.isnan(fraction.low) else f"{100 * fraction.low:.1f} to {100 * fraction.high:.1f}, "
-    return Cell(f"{100 * fraction.mean:.1f}", f"{ends}{basis}", fraction.mean)
 
 
 RELIABLE = (
@@ -169,9 +150,11 @@ def _probability_cells(probabilities: ProbabilityMeasures, answers: Mapping[str,
     before, after = probabilities["before"], probabilities["after"]
     errors = [(before["calibration_error"], after["calibration_error"]), (before["log_loss"], after["log_loss"])]
     rates = [
-        percent_cell(
-            Estimate(*(answers.get(f"{name}{end}", math.nan) for end in ("", "_low", "_high"))),
+        estimate(
+            (answers.get(f"{name}{end}") for end in ("", "_low", "_high")),
+            1,
             f"of {answers.get(f'{name}_n', 0):,}",
+            100,
         )
         for name in ("false_unknown", "false_known")
     ]
