@@ -217,11 +217,9 @@ def error_rows(trials: Sequence[Trial], groups: Groups) -> pd.DataFrame:
     """
     import pandas as pd
 
-    def about(trial: Trial) -> tuple[Any, ...]:
-        return trial.name, trial.object, trial.known, trial.seen
-
     rows = [
-        (*about(trial), predictor, group, step, trial.windows, groups.width(group), *sums)
+        (trial.name, trial.object, trial.known, trial.seen,
+         predictor, group, step, trial.windows, groups.width(group), *sums)
         for trial in trials
         for (predictor, group), both in trial.errors.items()
         for step, sums in enumerate(both.T, 1)
@@ -231,7 +229,7 @@ def error_rows(trials: Sequence[Trial], groups: Groups) -> pd.DataFrame:
 
 def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     """Return masks (channel,) of all channels, each sensor (``sensor1``, ``sensor2``, … in column order) and each axis."""
-    groups = {"both": np.ones(len(layout), dtype=bool)}
+    groups = {ALL_CHANNELS: np.ones(len(layout), dtype=bool)}
     streams = list(dict.fromkeys(channel["stream"] for channel in layout if "stream" in channel))
     for number, stream in enumerate(streams, 1):
         groups[f"sensor{number}"] = np.array([channel.get("stream") == stream for channel in layout])
