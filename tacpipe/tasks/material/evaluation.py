@@ -30,7 +30,6 @@ from tacpipe.tasks.material.predictions import (
     LEVEL,
     MODEL,
     PREDICTIONS,
-    PREDICTORS,
     SWAPPED,
     read_slides,
     score_tables,
@@ -139,8 +138,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         metrics["zero_shot"] = zero_shot
     sessions = {name: labels.get("session") for name, labels in attributes.items()}
     predicted, classes = predictions_table(evaluated, classifier, sessions), len(classifier.classes)
-    rows = read_slides(predicted, classifier.config)
-    predictors = [name for name in PREDICTORS if name in rows]
+    predictors = sorted({name for result in evaluated.values() for name in result.predicted})
+    rows = read_slides(predicted, classifier.config, predictors)
     learned, unseen = rows[~rows["held_out"]], rows[~rows["seen"]]
     tables, seen = (score_tables(learned[learned["seen"] == is_seen], evaluated, classes) for is_seen in (False, True))
     tree = {**summary(tables, predictors, classes), **metrics}

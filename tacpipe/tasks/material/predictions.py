@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,10 @@ MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
 LEVEL_ONLY, LEVEL_REMOVED = "level_only", "level_removed"  # baselines of the architecture statistics
 PREDICTORS = (MODEL, LEVEL, LEVEL_ONLY, LEVEL_REMOVED, SHUFFLED, SWAPPED, LAST)
+ABOUT = ("recording", "sensor", "material", "seen", "session")  # other columns
 
 
-def read_slides(table: pa.Table, config: MaterialConfig) -> pd.DataFrame:
+def read_slides(table: pa.Table, config: MaterialConfig, predictors: Sequence[str] = PREDICTORS) -> pd.DataFrame:
     """Return one row per counted slide: recording, sensor, material, session if any, and each predictor's material.
 
     Materials are numbers or text; a predictor that names none has NA. Two further columns state whether the model was
@@ -30,9 +31,9 @@ def read_slides(table: pa.Table, config: MaterialConfig) -> pd.DataFrame:
     an incomplete last batch do not count if ``config`` omits it, unless a sensor has fewer slides than a batch.
     """
     rows: pd.DataFrame = table.to_pandas(types_mapper={pa.int32(): pd.Int32Dtype()}.get)
-    naming, about = Naming.from_json(config), ("recording", "sensor", "material", "seen", "session")
-    rows = rows[[name for name in (*about, *PREDICTORS) if name in rows]]
-    for name in set(PREDICTORS) & set(rows):
+    naming = Naming.from_json(config)
+    rows = rows[[name for name in (*ABOUT, *predictors) if name in rows]]
+    for name in set(predictors) & set(rows):
         rows[name] = rows[name].mask(rows[name] == UNKNOWN)
     rows["held_out"] = False
     for sensor, held_out in config.get("held_out", {}).items():
@@ -59,10 +60,11 @@ def read_predictions(table: pa.Table, config: MaterialConfig) -> pd.DataFrame:
 
 def score_tables(slides: pd.DataFrame, sensors: Iterable[str], classes: int) -> dict[str, ScoreTable]:
     """Return the table of scores of each sensor's slides, which are rows of `read_slides`, among ``classes``."""
+    predictors = [str(name) for name in slides if name not in (*ABOUT, "held_out")]
     tables = {}
     for sensor in sensors:
         right: dict[str, Mapping[str, bool]] = {}
-        for name in (name for name in PREDICTORS if name in slides):
+        for name in predictors:
             rows = slides[(slides["sensor"] == sensor) & slides[name].notna()]
             right[name] = dict(zip(rows["recording"], rows[name] == rows["material"], strict=True))
         tables[sensor] = headline.score_table(right, classes)

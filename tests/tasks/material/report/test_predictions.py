@@ -38,3 +38,16 @@ def test_a_predictor_that_says_nothing_of_a_sensor_has_no_names_there() -> None:
     biotac = read_rows[read_rows["sensor"] == "biotac"]
     assert read_rows[read_rows["sensor"] == "roboskin"]["swapped"].isna().all()
     assert (biotac["swapped"] == biotac["material"]).all()
+
+
+def test_a_baseline_of_another_package_has_scores_too() -> None:
+    fake_result = result(wrong=BOTH, also={"own_baseline": {"biotac": 3, "roboskin": 0}})
+    config: Any = json.loads(fake_result.files["config.json"])
+    table = fake_result.recordings["predictions"].table()
+    rows = predictions.read_slides(table, config, ("model", "own_baseline"))
+    sums = predictions.score_tables(rows[~rows["seen"]], BOTH, 4)["biotac"].sums
+    assert {name: sum(right for right, _ in of_slides.values()) for name, of_slides in sums.items()} == {
+        "model": 19,
+        "own_baseline": 17,
+        "chance": 5,
+    }
