@@ -50,6 +50,8 @@ class SharedFiles:
         """
         key = digest({"run": self.store.run, "of": content_key})
         path, failed = (self.store.draft(digest([key, part])[:32]) for part in ("made", "failed"))
+        if present(path):  # it was renamed when it was complete
+            return Path(path)
         with self.store.leases.hold(key, "the recordings of a file"):
             if present(failed):
                 raise TacpipeError(regular.content(failed, _MAX_MESSAGE_BYTES, follow=False).decode())

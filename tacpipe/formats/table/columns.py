@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,6 @@ from typing import Any, Protocol, get_args
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from tacpipe.channels.schema import field_metadata
 from tacpipe.errors import TacpipeError
@@ -78,6 +78,23 @@ def choose_columns(
     only the properties that it sets. A name without a column becomes a note, because some recordings of a lab may lack a
     column. Raises `TacpipeError` for a column without a description, another rule without a match, and duplicate names.
     """
+    if declared:
+        return _choose_columns(stream, names, path, declared, lacks_allowed=False)[0]
+    chosen_columns, lacking = _choose_undeclared(stream, tuple(names), path, lacks_allowed=notes is not None)
+    if lacking and notes is not None:
+        notes.append(f"{stream.name} has no column {listed(lacking, 3)}.")
+    return list(chosen_columns)
+
+
+def _choose_columns(
+    stream: StreamLayout,
+    names: Sequence[str],
+    path: Path,
+    declared: Declared = NO_DECLARATION,
+    *,
+    lacks_allowed: bool,
+) -> tuple[list[ChosenColumn], list[str]]:
+    """Return the columns as `choose_columns` does, and the names in the layout without a column, if they are allowed."""
     chosen_columns: list[ChosenColumn] = []
     used = set()
     for name in names:
@@ -98,9 +115,7 @@ def choose_columns(
         chosen_columns = _in_one_order(chosen_columns, stream)
     unused = [rule.match for rule in stream.columns if rule not in used]
     are_names = not any(set("{*") & set(match) for match in unused)
-    if unused and are_names and chosen_columns and not declared and notes is not None:
-        notes.append(f"{stream.name} has no column {listed(unused, 3)}.")
-    elif unused:
+    if unused and not (are_names and chosen_columns and lacks_allowed):
         raise TacpipeError(
             f"{path} has no column that matches {listed(unused, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
         )
@@ -113,7 +128,10 @@ def choose_columns(
         )
     if not chosen_columns:
         raise TacpipeError(f"{path}: [streams.{stream.name}] skips all columns. Name one that is to be read.")
-    return chosen_columns
+    return chosen_columns, unused
+
+
+_choose_undeclared = functools.lru_cache(maxsize=16)(_choose_columns)  # a table is read for each recording in it
 
 
 def _in_one_order(chosen_columns: Sequence[ChosenColumn], stream: StreamLayout) -> list[ChosenColumn]:
@@ -250,8 +268,11 @@ def exceeds_floats(column: pa.Array, target: ChosenColumn) -> bool:
     """Return whether a converted column has whole numbers that were rounded, because the layout does not state a type."""
     if target.rule.type is not None or target.rule.scale != 1.0 or not pa.types.is_float64(column.type):
         return False
-    limits = pc.min_max(column)
-    most = max(abs(limits[side].as_py() or 0.0) for side in ("min", "max"))
+    chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
+    most = 0.0
+    for chunk in chunks:
+        values = chunk.to_numpy(zero_copy_only=False)
+        most = max(most, np.fmax.reduce(values, initial=0.0), -np.fmin.reduce(values, initial=0.0))
     return bool(MAX_EXACT < most < 2.0**64)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -79,7 +80,7 @@ class LayoutCommand:
 
     def parsed(self, params: LayoutParams) -> layouts.Layout:
         """Return the parsed layout, or an empty one if none was given."""
-        return layouts.layout_from_tables(json.loads(params.layout or "{}"), "The layout", self.kind)
+        return _parsed(params.layout or "{}", self.kind)
 
     def discover(self, params: LayoutParams, source: Path) -> dict[str, Source]:
         """Return the files, labels and episode of each recording at or below ``source``."""
@@ -154,6 +155,12 @@ class LayoutCommand:
         if self.kind is not None and layout.found_by_format:
             return recordings.find_contained(layout, self.kind, source)
         return recordings.find_recordings(layout, source)
+
+
+@functools.lru_cache(maxsize=1)  # a process reads many recordings with one layout
+def _parsed(text: str, kind: layouts.Format | None) -> layouts.Layout:
+    """Return the parsed layout in a JSON text."""
+    return layouts.layout_from_tables(json.loads(text), "The layout", kind)
 
 
 class _ContainerShares:

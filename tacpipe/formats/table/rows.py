@@ -1,19 +1,17 @@
 """Read the rows of a file block by block, optionally only those of one of its recordings.
 
 A file of several recordings is split once, so that each recording then reads only its own rows. The split file contains
-Arrow record batches (https://arrow.apache.org/docs/format/Columnar.html), one per recording and block, followed by a
-JSON index and the index's length in eight bytes.
+Arrow record batches (https://arrow.apache.org/docs/format/Columnar.html), one per recording and block, followed by an
+index as an Arrow table and the index's length in eight bytes.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -49,33 +47,37 @@ def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
             yield item
 
 
+SMALL_BYTES = 1 << 20
 ROW_COLUMN = "row"  # last column, with each row's position in the file
 _LENGTH = 8  # bytes
 
 
 def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) -> None:
     """Write the rows of ``blocks`` to ``draft``, separated by the value of the column ``recording``."""
-    block_spans: dict[str, list[tuple[int, int]]] = {}
-    schema, start_row = None, 0
+    names: list[str] = []
+    spans: list[tuple[int, int]] = []
+    schema, start_row = pa.schema([]), 0
     for block in blocks:
         for name, rows in _rows_by_recording(block, recording, start_row):
             schema = rows.schema
             for batch in rows.combine_chunks().to_batches():
                 content = memoryview(batch.serialize())
-                block_spans.setdefault(name, []).append((draft.tell(), len(content)))
+                names.append(name)
+                spans.append((draft.tell(), len(content)))
                 draft.write(content)
         start_row += block.num_rows
-    described = "" if schema is None else base64.b64encode(schema.serialize().to_pybytes()).decode()
-    index = json.dumps({"schema": described, "places": block_spans}).encode()
-    draft.write(index)
-    draft.write(len(index).to_bytes(_LENGTH, "little"))
+    starts, sizes = np.array(spans, np.int64).reshape(-1, 2).T
+    index = pa.table({"recording": pa.array(names, pa.string()), "start": starts, "bytes": sizes})
+    index = index.replace_schema_metadata({_SCHEMA: schema.serialize().to_pybytes()})
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, index.schema) as writer:
+        writer.write_table(index)
+    content = memoryview(sink.getvalue())
+    draft.write(content)
+    draft.write(len(content).to_bytes(_LENGTH, "little"))
 
 
-class CutIndex(TypedDict):
-    """The index at the end of a `cut`."""
-
-    places: dict[str, list[tuple[int, int]]]  # first byte and number of bytes of each block, by recording
-    schema: str  # base64
+_SCHEMA = b"rows"  # key of the schema of the rows in the metadata of the index
 
 
 def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indices]]:
@@ -84,10 +86,11 @@ def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indice
         file.seek(-_LENGTH, 2)
         length = int.from_bytes(file.read(_LENGTH), "little")
         file.seek(-_LENGTH - length, 2)
-        index: CutIndex = json.loads(file.read(length))
-        for offset, size in index["places"].get(recording, ()):
-            file.seek(offset)
-            schema = pa.ipc.read_schema(owned(base64.b64decode(index["schema"])))
+        index = pa.ipc.open_stream(owned(file.read(length))).read_all()
+        schema = pa.ipc.read_schema(owned(index.schema.metadata[_SCHEMA]))
+        own = index.filter(pc.equal(index["recording"], recording))
+        for start, size in zip(own["start"].to_pylist(), own["bytes"].to_pylist(), strict=True):
+            file.seek(start)
             table = pa.Table.from_batches([pa.ipc.read_record_batch(owned(file.read(size)), schema)])
             yield table.select(range(table.num_columns - 1)), table.column(table.num_columns - 1).to_numpy()
 
@@ -257,12 +260,18 @@ def _select_rows(
         yield from read_cut_rows(shared.file([str(file.path), stream.name], cut), str(recording))
         return
     start_row = 0
-    for block in read_ahead(file.batches(column_types)):
+    blocks = file.batches(column_types)
+    for block in blocks if _is_small(file.path) else read_ahead(blocks):
         rows = np.arange(block.num_rows)
         if stream.recording:
             rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
         yield (block.take(pa.array(rows)) if stream.recording else block), rows + start_row
         start_row += block.num_rows
+
+
+def _is_small(path: Path) -> bool:
+    """Return whether a path is a file that is read faster than a thread starts."""
+    return path.is_file() and path.stat().st_size <= SMALL_BYTES
 
 
 def stamps_of_column(
