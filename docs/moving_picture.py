@@ -6,6 +6,7 @@ datasets; stored results are reused.
 
 from __future__ import annotations
 
+import functools
 import io
 import sys
 from pathlib import Path
@@ -70,11 +71,17 @@ def draw(folder: Path) -> None:
     first.save(PICTURE, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
 
 
+@functools.cache
+def _table(folder: Path, dataset: str, name: str, stream: str = "") -> pd.DataFrame:
+    """Return a stream of a recording, read once for all frames."""
+    return tacpipe.open(folder / dataset)[name].table(stream).to_pandas()
+
+
 def _slips(folder: Path, name: str) -> tuple[pd.DataFrame, tuple[int, int]]:
     """Return the predictions of slips in a recording, and the begin and end of its slip in the simulation."""
-    truth = tacpipe.open(folder / "replayed")[name].table("truth").to_pandas()
+    truth = _table(folder, "replayed", name, "truth")
     slipping_ns = truth["t_ns"][truth["gt_slip"] > 0]
-    predicted = tacpipe.open(folder / "slips")[name].table().to_pandas()
+    predicted = _table(folder, "slips", name)
     return predicted, (int(slipping_ns.iloc[0]), int(slipping_ns.iloc[-1]))
 
 
@@ -86,13 +93,12 @@ def _frame(folder: Path, name: str, at_s: float) -> Image:
     slips, slip = _slips(folder, name)
     slip_ns, _ = slip
     now_ns = slip_ns + round(at_s * 1e9)
-    recording = tacpipe.open(folder / "replayed")[name]
     figure = Figure(figsize=(9.2, 2.9), dpi=80, layout="constrained")
     grid = figure.add_gridspec(1, 4, width_ratios=[1, 1, 1.9, 1.9])
     for column, skin in enumerate(SKINS):
-        _draw_skin(figure.add_subplot(grid[column]), recording.table(skin).to_pandas(), now_ns, SKINS[skin])
-    forecasts = tacpipe.open(folder / "forecasts")[name].table().to_pandas()
-    _draw_forecast(figure.add_subplot(grid[2]), recording.table("xela1").to_pandas(), forecasts, slip_ns, now_ns)
+        _draw_skin(figure.add_subplot(grid[column]), _table(folder, "replayed", name, skin), now_ns, SKINS[skin])
+    forecasts = _table(folder, "forecasts", name)
+    _draw_forecast(figure.add_subplot(grid[2]), _table(folder, "replayed", name, "xela1"), forecasts, slip_ns, now_ns)
     _draw_alarm(figure.add_subplot(grid[3]), slips, slip, now_ns)
     buffer = io.BytesIO()
     figure.savefig(buffer)

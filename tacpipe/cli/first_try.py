@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.cli import demo, steps
-from tacpipe.errors import UsageError
+from tacpipe.errors import DONE, FAILED, UsageError
 from tacpipe.io import terminal
 from tacpipe.plugins import extras
 from tacpipe.printable import listed
@@ -26,6 +26,7 @@ MIN_RECORDINGS = 4  # recordings of each label, so that training and test have s
 MAX_LABELS = 20
 MANY_RECORDINGS = 30  # recordings from which some are for validation
 MEASURED = ("force", "torque")  # quantities that are learned if there is no label
+NAME = "The try"  # in errors
 NEXT = """Each line after $ is a command that you can change and run again. After a change of {output}/layout.toml or of
 labels, `tacpipe try {folder} -o {output}` computes what depends on it."""
 
@@ -49,7 +50,7 @@ def run(folder: Path, output: Path) -> Path:
         terminal.note(f"The guess is written to {layout}. Correct it there, and run the same command again.")
     given = ["--layout", str(layout)] if layout.exists() else []
     _run("ingest", kind, str(folder), *given, "-o", str(recordings))
-    _run("check", str(recordings), output="shown")
+    steps.run(["check", str(recordings)], NAME, "shown", codes=(DONE, FAILED))  # FAILED: there are findings
 
     import tacpipe
 
@@ -84,7 +85,7 @@ def _why_nothing_is_learned(dataset: Dataset, kind: str, folder: Path, output: P
 
 
 def _run(*words: str, output: steps.Output = "ignored") -> str:
-    return steps.run(words, "The try", output)
+    return steps.run(words, NAME, output)
 
 
 def format_of(folder: Path) -> str:

@@ -5,21 +5,21 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Literal
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import DONE, TacpipeError
 from tacpipe.io import terminal, termination
 
 _STDERR = 2
 Output = Literal["ignored", "shown", "returned"]
 
 
-def run(words: Sequence[str], name: str, output: Output = "ignored") -> str:
+def run(words: Sequence[str], name: str, output: Output = "ignored", *, codes: Collection[int] = (DONE,)) -> str:
     """Print a command and run it in a process of its own, which prints its errors.
 
-    Its ``output`` on stdout is ignored, or shown on stderr, or returned. ``name`` is what stops if it fails: raises
-    `TacpipeError`.
+    Its ``output`` on stdout is ignored, or shown on stderr, or returned. Raises `TacpipeError`, which says that ``name``
+    stopped, if the command does not end with one of ``codes``.
     """
     line = f"tacpipe {shlex.join(words)}"
     terminal.note(f"$ {line}")
@@ -33,6 +33,6 @@ def run(words: Sequence[str], name: str, output: Output = "ignored") -> str:
             process.terminate()
             process.wait()
             raise
-    if process.returncode and words[0] != "check":  # it ends with 1 if it finds something
+    if process.returncode not in codes:
         raise TacpipeError(f"{name} stopped: `{line}` ended with {process.returncode}.")
     return printed or ""

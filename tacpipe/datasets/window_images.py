@@ -39,7 +39,7 @@ class ImageOptions:
     cameras: ReadableDataset
     size: int | tuple[int, int] | None  # height and width in pixels; one number for both; None for those of the camera
     roi: tuple[int, int, int, int] | None  # left, top, width and height of the part in pixels
-    difference: bool  # whether the mean of the first `UNTOUCHED_FRAMES` frames is subtracted
+    difference: bool  # True if the mean of the first `UNTOUCHED_FRAMES` frames is subtracted
     transform: Transform | None  # applied to the images (time, colour, height, width) of a camera
 
     def __post_init__(self) -> None:

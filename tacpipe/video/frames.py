@@ -69,7 +69,7 @@ class FrameReader:
             masks.append(_has_image(batch))
         self.has_image: Bools = np.concatenate(masks)  # (row,), False for a row without an image or with a damaged one
         self._latest: dict[int, Bytes] = {}  # images of the last call
-        self._frames: Iterator[tuple[int, Any]] = iter(())  # from row `_next_row` on
+        self._frames: Iterator[tuple[int, Any]] = iter(())  # its next frame is that of `_next_row`
         self._start = self._next_row = self._stop = -1  # rows of the packets for the decoder
 
     def read(self, rows: Sequence[int]) -> Bytes:

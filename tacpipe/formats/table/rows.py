@@ -47,7 +47,7 @@ def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
             yield item
 
 
-SMALL_BYTES = 1 << 20
+SMALL_BYTES = 1 << 20  # size of a file up to which starting a thread takes longer than reading it
 ROW_COLUMN = "row"  # last column, with each row's position in the file
 _LENGTH = 8  # bytes
 
@@ -270,7 +270,7 @@ def _select_rows(
 
 
 def _is_small(path: Path) -> bool:
-    """Return whether a path is a file that is read faster than a thread starts."""
+    """Return whether a path is a file of up to `SMALL_BYTES`."""
     return path.is_file() and path.stat().st_size <= SMALL_BYTES
 
 
